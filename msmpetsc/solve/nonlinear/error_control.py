@@ -1,17 +1,16 @@
-"""Stopping rule of a step: the estimated error of an iterate x, and the tolerance of the next
-linear solve.
+"""Stopping rule of a step: the error of an iterate x, and the tolerance of the next linear solve.
 
 The relative error of x is |x - x*|_M / |x - y|_M. Two numbers stand for the error:
 
 1. |F(x)|_(M^-1) is an upper bound if E is convex between x and x*.
-2. An estimate solves for the Newton correction at x (error_estimate), once the bound is near.
+2. The Newton correction at x is the error up to terms of second order (error_estimate). Newton's
+   linear solve finds it on its way. Other methods solve for it once the bound is near the goal.
 
 The next linear solve reduces its residual by
 
-    rtol = min(ksp_rtol, max((|F_k| / |F_(k-1)|)^2, goal / (2 error)))
+    rtol = min(ksp_rtol, (|F_k| / |F_(k-1)|)^2)
 
-(Eisenstat and Walker 1996, Choosing the Forcing Terms in an Inexact Newton Method, Choice 2; Kelley
-1995, Iterative Methods for Linear and Nonlinear Equations, Eq. 6.20).
+(Eisenstat and Walker 1996, Choosing the Forcing Terms in an Inexact Newton Method, Choice 2).
 """
 
 from dataclasses import dataclass, replace
@@ -110,10 +109,7 @@ class ErrorControl:
     ratio: float = FIRST_RATIO
 
     def judge(self, iterate: Iterate, before: Outcome) -> Outcome:
-        """Return the outcome at an iterate, with its error.
-
-        The error is the upper bound while the bound is far above the goal.
-        """
+        """Return the outcome at an iterate, with an upper bound of its error."""
         residual, distance = (
             self.functional.dual_norm(iterate.f),
             self.functional.distance(iterate.q),
@@ -129,15 +125,23 @@ class ErrorControl:
         # No error is relative to the start x = y
         if not distance > 0 or not np.isfinite(residual):
             return replace(now, error=0.0 if at_rounding else np.inf)
-        now = replace(now, bound=residual / distance)
-        if not (at_rounding or now.bound <= self.ratio * now.goal):
-            return replace(now, error=now.bound)
-        if now.bound <= now.goal:
-            now = self.with_compression(iterate, now)
-            assert now.compression is not None
-            lowest = now.compression.least_curvature
-            if lowest > 0 and now.bound <= now.goal * lowest:
-                return replace(now, error=now.bound / lowest)
+        bound = residual / distance
+        now = replace(now, bound=bound, error=bound)
+        if bound > now.goal:
+            return now
+        now = self.with_compression(iterate, now)
+        assert now.compression is not None
+        lowest = now.compression.least_curvature
+        return replace(now, error=bound / lowest if lowest > 0 else np.inf)
+
+    def is_near(self, now: Outcome) -> bool:
+        """Return whether the error may be below the goal, by the last ratio of bound to error."""
+        return now.at_rounding or now.bound <= self.ratio * now.goal
+
+    def estimated_if_near(self, iterate: Iterate, now: Outcome) -> Outcome:
+        """Return the outcome with an estimated error if the error may be below the goal."""
+        if now.error <= now.goal or not self.is_near(now):
+            return now
         return self.estimated(iterate, now, now.goal)
 
     def with_compression(self, iterate: Iterate, now: Outcome) -> Outcome:
@@ -154,22 +158,29 @@ class ErrorControl:
         The error is relative to |x - e - y|_M, e the Newton correction, since x may still be close
         to y.
         """
-        distance = now.distance
-        length = self.estimate(iterate, goal * distance)
+        length = self.estimate(iterate, goal * now.distance)
         if not np.isfinite(length):
             return replace(now, error=now.bound, alarm=Alarm.HERE)
-        self.ratio = max(now.bound * distance / length, 1.0) if length > 0 else 1.0
-        error = self.rounding.relative(
-            length, self.functional.distance(iterate.q, self.estimate.correction)
-        )
-        return replace(now, error=error, corrected=True)
+        return self.measured(iterate, now)
+
+    def measured(self, iterate: Iterate, now: Outcome, trust: float = 1.0) -> Outcome:
+        """Return the outcome with the error that the last solve for the correction measured.
+
+        trust : lower bound of the share of the error that the correction is
+        """
+        estimate = self.estimate
+        length = estimate.correction_norm + estimate.missing
+        self.ratio = max(now.bound * now.distance / length, 1.0) if length > 0 else 1.0
+        if not trust > 0:
+            return replace(now, error=np.inf)
+        distance = self.functional.distance(iterate.q, estimate.correction)
+        return replace(now, error=self.rounding.relative(length / trust, distance), corrected=True)
 
     def tolerance(self, now: Outcome) -> float:
         """Return the tolerance of the linear solve at an iterate."""
-        if not now.goal * now.bound > 0:
+        if not now.goal > 0:
             return self.rtol
-        needed = max(now.reduction**2, 0.5 * now.goal * self.ratio / now.bound)
-        return min(max(needed, CLOSEST * self.rtol), self.rtol)
+        return min(max(now.reduction**2, CLOSEST * self.rtol), self.rtol)
 
     def doubt(self, now: Outcome, has_moved: bool) -> Outcome | None:
         """Return the outcome from which a step goes on after a doubt; None without any gain.

@@ -1,9 +1,18 @@
-"""Estimate of a step's error at x by the Newton correction e: H e = F(x), H the true Hessian of g.
+"""Error of a step at x by the Newton correction e: H e = F(x), H the true Hessian of g.
 
-Terms of second order are left out. |F|_(M^-1) bounds |e|_M, but overestimates it a thousandfold on
-stiff bodies. Iteration k of CG on H, with the step's preconditioner, has found e_k. The missing
-part of e has at most the norm |r_k|_(M^-1) / lambda in M, if no eigenvalue of M^(-1) H is below
-lambda. The solve ends if
+Terms of second order are left out. Iteration k of CG on H, with the step's preconditioner P, has
+found e_k. The missing part of e is bounded in two ways,
+
+    |e - e_k|_M <= |r_k|_(M^-1) / lambda
+    |e - e_k|_M <= |r_k|_(P^-1) / sqrt(lambda kappa)
+
+with r_k = F - H e_k, if no eigenvalue of M^(-1) H is below lambda and none of P^(-1) H below kappa.
+The first bound is safe, but too high by up to a thousand on stiff bodies. The second is close, but
+too low if CG has not met the least eigenvalue, since kappa is its least Ritz value. The geometric
+mean of both stands for the missing part in Newton's own solves (CorrectionTest). With contact, and
+in a solve for the estimate alone (ErrorEstimate), it is the first bound.
+
+A solve for the estimate alone ends if
 
 - |e_k|_M is above the acceptable error, or
 - |e_k|_M and the missing part together are acceptable, or
@@ -88,9 +97,7 @@ class ErrorEstimate:
             return reasons.DIVERGED_NANORINF
         if residual > 0 and its == 0:
             return reasons.ITERATING
-        self.residual = ksp.buildResidual(self.residual)
-        self.correction_norm = self.functional.norm(ksp.getSolution())
-        self.missing = self.functional.dual_norm(self.residual) / self.lowest
+        self.measure(ksp)
         is_decided = (
             0 < self._acceptable < self.correction_norm
             or self.correction_norm + self.missing <= self._acceptable
@@ -99,7 +106,79 @@ class ErrorEstimate:
             return reasons.CONVERGED_ITS
         return reasons.ITERATING
 
+    def measure(self, ksp: PETSc.KSP, natural: float = np.inf, least: float = 0.0) -> None:
+        """Measure the correction that a solve H e = F has found so far, and its missing part.
+
+        natural : |r_k|_(P^-1)
+        least   : kappa; 0 for the first bound alone
+        """
+        self.residual = ksp.buildResidual(self.residual)
+        self.correction_norm = self.functional.norm(ksp.getSolution())
+        self.missing = self.functional.dual_norm(self.residual) / self.lowest
+        if least > 0:
+            close = natural / float(np.sqrt(self.lowest * least))
+            self.missing = min(self.missing, float(np.sqrt(self.missing * close)))
+
     def destroy(self) -> None:
         """Destroy all PETSc objects (collective)."""
         for owned in (self.ksp, self.correction, self.residual, self.operator):
             owned.destroy()
+
+
+class CorrectionTest:
+    """Convergence test of Newton's solves H y = F by CG, which also tests the error of x.
+
+    y is the correction of an error estimate. CG ends as soon as it shows that |y|_M, the error of
+    x, is acceptable. Otherwise it ends by the tolerances of KSP.
+
+    estimate    : measures y
+    is_accepted : whether the last solve has shown that the error of x is acceptable
+    """
+
+    def __init__(self, estimate: ErrorEstimate, ksp: PETSc.KSP):
+        self.estimate, self.is_accepted = estimate, False
+        # Least eigenvalue of P^(-1) H that the step has met
+        self._least = np.inf
+        self._acceptable = self._first = 0.0
+        self._has_contact = False
+        ksp.setComputeSingularValues(True)
+        ksp.setConvergenceTest(self)
+
+    def begin_step(self) -> None:
+        """Forget the last step: its eigenvalues, and the error that it accepted."""
+        self._least, self._acceptable = np.inf, 0.0
+
+    def begin(self, acceptable: float, has_contact: bool) -> None:
+        """Begin a solve.
+
+        acceptable  : error [m sqrt(kg)] of x; 0 if the solve does not tell the error
+        has_contact : whether H has contact, whose small eigenvalues CG meets late
+        """
+        self.estimate.lowest, self.is_accepted = self.estimate.convexity, False
+        self._acceptable, self._has_contact = acceptable, has_contact
+
+    def __call__(self, ksp: PETSc.KSP, its: int, residual: float) -> PETSc.KSP.ConvergedReason:
+        """Return whether a solve ends (the convergence test of KSP)."""
+        reasons, (rtol, atol, divtol, _) = PETSc.KSP.ConvergedReason, ksp.getTolerances()
+        if not np.isfinite(residual):
+            return reasons.DIVERGED_NANORINF
+        if its == 0:
+            self._first = residual
+        elif self._acceptable > 0 and self._accepts(ksp, residual):
+            return reasons.CONVERGED_HAPPY_BREAKDOWN
+        if residual <= atol:
+            return reasons.CONVERGED_ATOL
+        if residual <= rtol * self._first:
+            return reasons.CONVERGED_RTOL
+        return reasons.DIVERGED_DTOL if residual >= divtol * self._first else reasons.ITERATING
+
+    def _accepts(self, ksp: PETSc.KSP, residual: float) -> bool:
+        """Return whether the error of x is shown to be acceptable."""
+        estimate = self.estimate
+        self._least = min(self._least, ksp.computeExtremeSingularValues()[1])
+        estimate.measure(ksp, residual, 0.0 if self._has_contact else self._least)
+        self.is_accepted = estimate.correction_norm + estimate.missing <= self._acceptable
+        if estimate.correction_norm > self._acceptable:
+            # The error is greater, so no later iteration shows that it is acceptable
+            self._acceptable = 0.0
+        return self.is_accepted

@@ -119,15 +119,13 @@ class Jacobian:
         contact: StepContactAt | None,
         projected: bool,
         duals: Duals | None,
-        known: bool = False,
     ) -> None:
         """Linearise H at positions q (l, 3) [m], and contact; A is constant (collective).
 
         projected : leave out the negative parts of H
         duals     : of friction; None for its true curvature
-        known     : H is linearised at q already
         """
-        if self.preset.true_hessian and not known:
+        if self.preset.true_hessian:
             self.hessian.linearise(q, contact, projected, duals)
         elif self.blocks:
             self.blocks.linearise(contact, contact.contact.no_duals() if contact else None)

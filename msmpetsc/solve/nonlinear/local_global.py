@@ -50,7 +50,7 @@ class LocalGlobal(StepMethod):
         self.base, self.outcome = start.q, replace(outcome, residual=np.inf)
         if self.has_npc:
             # The NPC solves with A before SNES tests its start
-            self.outcome = self.control.judge(start, self.outcome)
+            self.outcome = self._judge(start)
             if self.outcome.is_converged:
                 return start, self.outcome
             self.adapt(self.outcome)
@@ -70,6 +70,10 @@ class LocalGlobal(StepMethod):
             ends = f"-{self.prefix}snes_type {self.snes.getType()} ends by a rule of its own"
             raise InputError(f"{ends}, {self.outcome.error:.2e} off: {BY_ERROR}")
         return iterate, self.outcome
+
+    def _judge(self, iterate: Iterate) -> Outcome:
+        """Return the outcome at SNES's next iterate, its error estimated near the goal."""
+        return self.control.estimated_if_near(iterate, self.control.judge(iterate, self.outcome))
 
     def _residual(self, _: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
         """Write F(x) to f (SNESFunction)."""
@@ -107,7 +111,7 @@ class LocalGlobal(StepMethod):
                 iterate = self.functional.evaluate(x, self.own, q)
             else:
                 iterate = Iterate(x, q, self.f, self.functional.contact_at(q))
-            self.outcome = self.control.judge(iterate, self.outcome)
+            self.outcome = self._judge(iterate)
         reason = self.reason_to_end(its, self.outcome)
         if not reason:
             self.adapt(self.outcome)

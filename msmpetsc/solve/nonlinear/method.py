@@ -85,8 +85,9 @@ class StepMethod(ABC):
     def finish(self, iterate: Iterate, outcome: Outcome) -> Outcome:
         """Return the final outcome by SNES's reason. Raises StepStopped and StepFailed."""
         reason = self.snes.reason
-        if reason == REASON.CONVERGED_ITS and not (outcome.corrected or outcome.is_converged):
-            return self.control.estimated(iterate, outcome, 0.0)
+        if reason > 0 and not (outcome.corrected or outcome.error <= outcome.goal):
+            goal = 0.0 if reason == REASON.CONVERGED_ITS else outcome.goal
+            return self.control.estimated(iterate, outcome, goal)
         if reason < 0:
             if Stop.agreed(self.functional.comm):
                 raise StepStopped("stopped by a signal")

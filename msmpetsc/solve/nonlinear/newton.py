@@ -20,6 +20,7 @@ from msmpetsc.backend.arrays import Array, Positions
 from msmpetsc.contact.step_contact import StepContactAt
 from msmpetsc.solve.nonlinear.curvature import Alarm
 from msmpetsc.solve.nonlinear.error_control import Outcome
+from msmpetsc.solve.nonlinear.error_estimate import CorrectionTest
 from msmpetsc.solve.nonlinear.functional import Iterate
 from msmpetsc.solve.nonlinear.jacobian import FrictionDuals
 from msmpetsc.solve.nonlinear.method import REASON, StepMethod
@@ -39,6 +40,13 @@ LEAST, MOST = 0.1, 0.5
 SHORTEST = 1e-6
 # Share of its slope that a direction must keep when it is bent at obstacles
 DOWNHILL = 0.1
+# Options of PETSc's own convergence test of a linear solve
+TESTS = (
+    "ksp_convergence_test",
+    "ksp_converged_use_initial_residual_norm",
+    "ksp_converged_use_min_initial_residual_norm",
+    "ksp_converged_maxits",
+)
 KSP = PETSc.KSP.ConvergedReason
 # Reasons of KSP without a usable direction
 USELESS = (
@@ -55,9 +63,10 @@ class Newton(StepMethod):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        vectors = self.functional.vectors
-        self.y, self.end = vectors.take(), vectors.take()
+        # The direction of the loop is the correction of the error's estimate
+        self.y, self.end = self.control.estimate.correction, self.functional.vectors.take()
         self.friction = FrictionDuals()
+        self.test = self._create_test()
         self.most_its = self.ksp.getTolerances()[3]
         # V U' of the cells of a softer solid, for the first Hessian of the next solve
         self.slopes: Array | None = None
@@ -70,6 +79,17 @@ class Newton(StepMethod):
         """Begin the step that the functional has begun."""
         self.friction.begin(self.functional.problem.contact)
         self.slopes = None
+        if self.test:
+            self.test.begin_step()
+
+    def _create_test(self) -> CorrectionTest | None:
+        """Return the test of CG that also tells the error of x; None for other linear solves."""
+        is_cg = self.ksp.getType() == PETSc.KSP.Type.CG
+        is_natural = self.ksp.getNormType() == PETSc.KSP.NormType.NATURAL
+        of_user = any(map(self.options.is_given, TESTS))
+        if not (is_cg and is_natural) or of_user:
+            return None
+        return CorrectionTest(self.control.estimate, self.ksp)
 
     def minimise(self, start: Iterate, outcome: Outcome) -> tuple[Iterate, Outcome]:
         """Return the iterate that the loop ends at, and its outcome (StepMethod.minimise)."""
@@ -82,18 +102,21 @@ class Newton(StepMethod):
         """Run the loop of the method; PETSc calls it in SNESSolve."""
         assert self._given is not None
         now, outcome = self._given
-        outcome = self.control.judge(now, replace(outcome, residual=np.inf))
         # Iterations left with the projected Hessian
         projected, its = self.preset.projected, 0
+        outcome = self._judge(now, replace(outcome, residual=np.inf), projected)
         while not (reason := self._reason(snes, its, now, outcome)):
-            self._linearise(now, outcome, projected > 0)
+            tells_error = self._tells_error(now, outcome, projected)
+            self._linearise(now, tells_error, projected > 0)
             if its == 0 and (monitor := self.functional.problem.system_monitor):
                 monitor(now, self.jacobian)
-            if not self._solve(now, outcome):
+            outcome = self._solve(now, outcome, tells_error)
+            if self.ksp.reason in USELESS:
                 reason = REASON.DIVERGED_LINEAR_SOLVE
                 break
-            if self.ksp.reason == KSP.DIVERGED_INDEFINITE_MAT:
-                outcome = replace(outcome, alarm=max(outcome.alarm, Alarm.ON_THE_WAY))
+            if outcome.is_converged:
+                reason = REASON.CONVERGED_SNORM_RELATIVE
+                break
             self._limit(now)
             lower = self._search(now, outcome.is_flat)
             if lower is None and projected:
@@ -102,8 +125,8 @@ class Newton(StepMethod):
             if lower is None:
                 projected = PROJECTED
                 continue
-            now, outcome = lower, self.control.judge(lower, outcome)
             projected, its = max(projected - 1, 0), its + 1
+            now, outcome = lower, self._judge(lower, outcome, projected)
         self.iterations += its
         self._given = now, outcome
         now.x.copy(x)
@@ -125,37 +148,73 @@ class Newton(StepMethod):
             int(REASON.DIVERGED_MAX_IT) if its == most else 0
         )
 
-    def _linearise(self, now: Iterate, outcome: Outcome, projected: bool) -> None:
-        """Linearise F at an iterate, and set the initial guess of CG.
+    def _judge(self, iterate: Iterate, before: Outcome, projected: int) -> Outcome:
+        """Return the outcome at an iterate, with its error if the linear solve will not tell it."""
+        outcome = self.control.judge(iterate, before)
+        if self.test and not projected and self.slopes is None:
+            return outcome
+        return self.control.estimated_if_near(iterate, outcome)
 
-        If the error estimate there has found a correction, its H and the correction are reused.
+    def _tells_error(self, now: Iterate, outcome: Outcome, projected: int) -> bool:
+        """Return whether the next linear solve is of the true Hessian and tells the error.
 
-        projected : use H without its negative parts; the estimate has a Hessian with them
+        Far from the goal, duals stand for the curvature of friction.
         """
-        known = outcome.corrected and not projected
+        is_true = self.test is not None and not projected and self.slopes is None
+        return is_true and (now.contact is None or self.control.is_near(outcome))
+
+    def _linearise(self, now: Iterate, is_true: bool, projected: bool) -> None:
+        """Linearise F at an iterate.
+
+        is_true   : use the true curvature of friction, not its duals
+        projected : use H without its negative parts
+        """
         with LOCAL:
-            self.jacobian.linearise(now.q, now.contact, projected, self.friction.duals, known)
-            if self.slopes is not None and not (known or projected):
+            duals = None if is_true else self.friction.duals
+            self.jacobian.linearise(now.q, now.contact, projected, duals)
+            if self.slopes is not None and not projected:
                 self.jacobian.hessian.take_slopes(self.slopes)
             self.slopes = None
-        if not self.options.is_given("ksp_initial_guess_nonzero"):
-            # PREONLY has no initial guess
-            known = known and self.ksp.getType() != PETSc.KSP.Type.PREONLY
-            if known:
-                self.control.estimate.correction.copy(self.y)
-            self.ksp.setInitialGuessNonzero(known)
 
-    def _solve(self, now: Iterate, outcome: Outcome) -> bool:
-        """Solve H y = F; return whether y is usable."""
+    def _solve(self, now: Iterate, outcome: Outcome, tells_error: bool) -> Outcome:
+        """Solve H y = F; return the outcome with what the solve tells of the iterate.
+
+        tells_error : whether the solve may end as soon as it shows that the error is acceptable
+        """
         self.adapt(outcome)
         rtol = self.ksp.getTolerances()[0]
         if not self.options.is_given("ksp_max_it"):
             most = self.jacobian.preconditioner.most_iterations(rtol)
             self.ksp.setTolerances(max_it=most or self.most_its)
         self.ksp.setOperators(self.jacobian.operator)
+        if self.test:
+            acceptable = outcome.goal * outcome.distance if tells_error else 0.0
+            self.test.begin(acceptable, now.contact is not None)
         self.ksp.solve(now.f, self.y)
-        self.jacobian.preconditioner.learn(self.ksp.its, rtol, self._reduction())
-        return self.ksp.reason not in USELESS
+        self.jacobian.preconditioner.learn(self.ksp.its, self._reduction())
+        if self.ksp.reason == KSP.DIVERGED_INDEFINITE_MAT:
+            return replace(outcome, alarm=Alarm.HERE, corrected=False)
+        if self.test and self.test.is_accepted:
+            return self.control.measured(now, outcome, self._trust(now, outcome))
+        return replace(outcome, corrected=tells_error and self.ksp.reason > 0)
+
+    def _trust(self, now: Iterate, outcome: Outcome) -> float:
+        """Return a lower bound of the share of the error that y is; 0 if y says nothing of it.
+
+        If H does not predict a part theta |F(x)| of F(x - y), the error is at most
+        |y|_M / (1 - theta) (Deuflhard 2011, Newton Methods for Nonlinear Problems, Sect. 2.1).
+        """
+        functional, x = self.functional, self.end
+        x.waxpy(-1.0, self.y, now.x)
+        q, f = functional.positions(x), functional.vectors.take()
+        theta = np.inf
+        with LOCAL:
+            if functional.collision_free_step(now.q, q) == 1.0:
+                functional.evaluate(x, f, q)
+                f.axpy(-1.0, self.control.estimate.residual)
+                theta = functional.dual_norm(f) / outcome.residual
+        functional.vectors.give_back(f)
+        return max(1 - theta, 0.0)
 
     def _reduction(self) -> float:
         """Return the reduction of the residual by the last linear solve, at least rounding."""

@@ -54,7 +54,7 @@ SCENES = {
 def test_the_estimate_is_within_three_of_the_true_error(
     tmp_path: Path, name: str, preset: str, monkeypatch: pytest.MonkeyPatch
 ):
-    """Steps report an estimate or a bound. The bound may be far above the error, never far below."""
+    """Steps report an estimate or a bound, which may be far above the error, never far below."""
     step, estimates = Stepper.step, {}
 
     def estimated(self: Stepper, problem: StepProblem, start: Rows | None = None) -> StepResult:

@@ -151,17 +151,22 @@ class Newton(StepMethod):
     def _judge(self, iterate: Iterate, before: Outcome, projected: int) -> Outcome:
         """Return the outcome at an iterate, with its error if the linear solve will not tell it."""
         outcome = self.control.judge(iterate, before)
-        if self.test and not projected and self.slopes is None:
+        if self._can_tell_error(projected):
             return outcome
         return self.control.estimated_if_near(iterate, outcome)
 
-    def _tells_error(self, now: Iterate, outcome: Outcome, projected: int) -> bool:
-        """Return whether the next linear solve is of the true Hessian and tells the error.
+    def _can_tell_error(self, projected: int) -> bool:
+        """Return whether the next linear solve is of the true elastic Hessian, with the test."""
+        return self.test is not None and not projected and self.slopes is None
 
-        Far from the goal, duals stand for the curvature of friction.
+    def _tells_error(self, now: Iterate, outcome: Outcome, projected: int) -> bool:
+        """Return whether the next linear solve tells the error.
+
+        With contact it does so near the goal only. Before, duals stand for the curvature of
+        friction.
         """
-        is_true = self.test is not None and not projected and self.slopes is None
-        return is_true and (now.contact is None or self.control.is_near(outcome))
+        is_near = now.contact is None or self.control.is_near(outcome)
+        return is_near and self._can_tell_error(projected)
 
     def _linearise(self, now: Iterate, is_true: bool, projected: bool) -> None:
         """Linearise F at an iterate.
@@ -201,8 +206,9 @@ class Newton(StepMethod):
     def _trust(self, now: Iterate, outcome: Outcome) -> float:
         """Return a lower bound of the share of the error that y is; 0 if y says nothing of it.
 
-        If H does not predict a part theta |F(x)| of F(x - y), the error is at most
-        |y|_M / (1 - theta) (Deuflhard 2011, Newton Methods for Nonlinear Problems, Sect. 2.1).
+        Newton's corrections shrink by about theta if H does not predict a part theta |F(x)| of
+        F(x - y). The error is then at most |y|_M / (1 - theta) (Deuflhard 2011, Newton Methods for
+        Nonlinear Problems, Sect. 2.1).
         """
         functional, x = self.functional, self.end
         x.waxpy(-1.0, self.y, now.x)

@@ -104,6 +104,23 @@ def test_with_multigrid_a_proof_is_cheap(tmp_path: Path, law: str):
     assert 0 < proof < 0.45 * products
 
 
+def test_newtons_linear_solves_tell_the_error(tmp_path: Path):
+    """With PETSc's own test of convergence, the errors need solves of their own."""
+    words = ["--frames", "12", "--true-error", "1", "--error", "1e-3"]
+    # |F| says little of the error of a stiff body
+    stiff = {"young_modulus": 1e7, "density": 1000.0, "law": "neo-hookean"}
+    scene = SCENES["swings"] | {"material": stiff}
+    path, products = block_scene(tmp_path, gravity=GRAVITY, **scene), []
+    for options in ([], ["-ksp_convergence_test", "default"]):
+        out = tmp_path / f"{len(options)}.h5"
+        run(1, "-m", "msmpetsc", "run", path, "-o", out, *words, *options, status=0)
+        with h5py.File(out) as file:
+            said, true = (file["frames"][name][1:] for name in ("step_error", "true_error"))
+            products.append(file["frames"]["products"][:].sum())
+        assert (said <= 1e-3).all() and (true < 3 * said).all()
+    assert products[0] < 0.9 * products[1]
+
+
 def test_true_errors_are_those_of_a_dense_solve_of_one_spring():
     """A mass on a spring along z: x* in closed form, and g is a parabola, so its error is the
     other's square."""

@@ -8,9 +8,10 @@ The relative error of x is |x - x*|_M / |x - y|_M. Two numbers stand for the err
 
 The next linear solve reduces its residual by
 
-    rtol = min(ksp_rtol, (|F_k| / |F_(k-1)|)^2)
+    rtol = min(ksp_rtol, max((|F_k| / |F_(k-1)|)^2, goal / (2 error)))
 
-(Eisenstat and Walker 1996, Choosing the Forcing Terms in an Inexact Newton Method, Choice 2).
+(Eisenstat and Walker 1996, Choosing the Forcing Terms in an Inexact Newton Method, Choice 2; Kelley
+1995, Iterative Methods for Linear and Nonlinear Equations, Eq. 6.20).
 """
 
 from dataclasses import dataclass, replace
@@ -178,9 +179,10 @@ class ErrorControl:
 
     def tolerance(self, now: Outcome) -> float:
         """Return the tolerance of the linear solve at an iterate."""
-        if not now.goal > 0:
+        if not now.goal * now.bound > 0:
             return self.rtol
-        return min(max(now.reduction**2, CLOSEST * self.rtol), self.rtol)
+        needed = max(now.reduction**2, 0.5 * now.goal * self.ratio / now.bound)
+        return min(max(needed, CLOSEST * self.rtol), self.rtol)
 
     def doubt(self, now: Outcome, has_moved: bool) -> Outcome | None:
         """Return the outcome from which a step goes on after a doubt; None without any gain.

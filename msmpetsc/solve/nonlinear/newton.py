@@ -196,7 +196,7 @@ class Newton(StepMethod):
             acceptable = outcome.goal * outcome.distance if tells_error else 0.0
             self.test.begin(acceptable, now.contact is not None)
         self.ksp.solve(now.f, self.y)
-        self.jacobian.preconditioner.learn(self.ksp.its, self._reduction())
+        self.jacobian.preconditioner.learn(self.ksp.its, rtol, self._reduction())
         if self.ksp.reason == KSP.DIVERGED_INDEFINITE_MAT:
             return replace(outcome, alarm=Alarm.HERE, corrected=False)
         if self.test and self.test.is_accepted:

@@ -152,15 +152,15 @@ class LatticePreconditioner:
             else int(self.rate * _digits(rtol) + PATIENCE - self.excess)
         )
 
-    def learn(self, its: int, reached: float) -> None:
-        """Count the iterations of a linear solve that has reduced the residual to a share.
+    def learn(self, its: int, rtol: float) -> None:
+        """Count the iterations of a linear solve to a relative tolerance.
 
         A hierarchy is kept until its excess iterations have cost as much as a new hierarchy. The
         total cost is at most twice the least.
         """
         if its == 0:
             return
-        digits = _digits(reached)
+        digits = _digits(rtol)
         if self.rate is None:
             self.rate = its / digits
         self.excess += max(its - self.rate * digits, 0.0)
@@ -221,9 +221,9 @@ class LatticePreconditioner:
         self.multigrid.destroy()
 
 
-def _digits(reduction: float) -> float:
-    """Return the digits of a solve with this reduction of the residual, at least 0.1."""
-    return max(-float(np.log10(reduction)), 0.1)
+def _digits(rtol: float) -> float:
+    """Return the digits that a solve to this tolerance gains, at least 0.1."""
+    return max(-float(np.log10(rtol)), 0.1)
 
 
 def expected_iterations(ratio: float) -> float:
@@ -332,13 +332,14 @@ class StepPreconditioner:
         """Return the most iterations of a solve to a tolerance; None for PETSc's option."""
         return self.multigrid.most_iterations(rtol) if self.multigrid and self.is_chosen else None
 
-    def learn(self, its: int, reached: float) -> None:
+    def learn(self, its: int, rtol: float, reached: float) -> None:
         """Count the iterations of a linear solve.
 
+        rtol    : relative tolerance of the solve
         reached : reduction of the residual in the natural norm
         """
         if self.multigrid and self.is_chosen:
-            self.multigrid.learn(its, reached)
+            self.multigrid.learn(its, rtol)
         elif self.chooses and its * np.log(2 / USUAL) > LONG * np.log(2 / reached):
             self._choose(f"Jacobi's took {its} iterations a solve")
 

@@ -8,9 +8,10 @@ found e_k. The missing part of e is bounded in two ways,
 
 with r_k = F - H e_k, if no eigenvalue of M^(-1) H is below lambda and none of P^(-1) H below kappa.
 The first bound is safe, but too high by up to a thousand on stiff bodies. The second is close, but
-too low if CG has not met the least eigenvalue, since kappa is its least Ritz value. The geometric
-mean of both stands for the missing part in Newton's own solves (CorrectionTest). With contact, and
-in a solve for the estimate alone (ErrorEstimate), it is the first bound.
+too low if CG has not met the least eigenvalue, since kappa is its least Ritz value. It is at most
+1, the mean of the eigenvalues if P is the diagonal of H. The geometric mean of both stands for the
+missing part in Newton's own solves (CorrectionTest). With contact, and in a solve for the estimate
+alone (ErrorEstimate), it is the first bound.
 
 A solve for the estimate alone ends if
 
@@ -137,8 +138,8 @@ class CorrectionTest:
 
     def __init__(self, estimate: ErrorEstimate, ksp: PETSc.KSP):
         self.estimate, self.is_accepted = estimate, False
-        # Least eigenvalue of P^(-1) H that the step has met
-        self._least = np.inf
+        # Least eigenvalue of P^(-1) H that the step has met, at most 1
+        self._least = 1.0
         self._acceptable = self._first = 0.0
         self._has_contact = False
         ksp.setComputeSingularValues(True)
@@ -146,7 +147,7 @@ class CorrectionTest:
 
     def begin_step(self) -> None:
         """Forget the last step: its eigenvalues, and the error that it accepted."""
-        self._least, self._acceptable = np.inf, 0.0
+        self._least, self._acceptable = 1.0, 0.0
 
     def begin(self, acceptable: float, has_contact: bool) -> None:
         """Begin a solve.

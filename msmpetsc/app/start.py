@@ -132,7 +132,7 @@ def frames(
 
     Parameters
     ----------
-    scene : path, mapping or Scene
+    scene : path or mapping or Scene
         Scene file, tables as in a scene file, or a checked scene.
     frames : int, optional
         Stop after this number of steps.

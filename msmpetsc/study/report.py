@@ -18,7 +18,7 @@ from msmpetsc.study.charts.curves import growth_charts, pareto_charts, size_char
 from msmpetsc.study.charts.plot import Chart, curve_styles, save_png, svg_text
 from msmpetsc.study.charts.profile import profile_charts
 from msmpetsc.study.charts.stability import stability_charts
-from msmpetsc.study.metrics import counted
+from msmpetsc.study.outcomes import counted
 from msmpetsc.study.table import (
     NUMBERS,
     ONCE_NOTE,

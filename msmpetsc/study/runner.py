@@ -20,11 +20,11 @@ from msmpetsc.study.metrics import (
     costs,
     frame_metrics,
     merge_repeats,
-    outcome,
     read_record,
     surface_error,
     trajectory_error,
 )
+from msmpetsc.study.outcomes import outcome
 from msmpetsc.study.process import Ended, Processes, too_long
 from msmpetsc.study.study_file import Study, load_study
 from msmpetsc.study.table import Row, read_table, records, require_extra, write_table

@@ -8,8 +8,8 @@ import pytest
 from block_scene import block_scene
 from one_process import command_error
 
-from msmpetsc.cli.commands.check import Numbers, Recipe, allowed, judged, read
 from msmpetsc.cli.main import main
+from msmpetsc.results.baseline import Numbers, Recipe, allowed, judged, read
 
 STEPS = 3
 

@@ -20,10 +20,11 @@ from conftest import ROOT
 from one_process import input_error
 
 from msmpetsc.app.checks import MOVIE_NAMES, PAGE_NAMES, PICTURE_NAMES
-from msmpetsc.cli.commands import check, new
+from msmpetsc.cli.commands import new
 from msmpetsc.cli.main import parsed
 from msmpetsc.errors import InputError
 from msmpetsc.export.formats import FORMATS, export
+from msmpetsc.results import baseline
 from msmpetsc.results.reader import Result
 from msmpetsc.results.xdmf import write_xdmf
 from msmpetsc.study.charts.plot import COUNT, Chart, curve_styles, log_axis, save_png
@@ -100,7 +101,9 @@ def writers(sources: Path) -> dict[str, Writer]:
             "cli/commands/new.py",
             lambda path: new.run(parsed(["new", str(path), "--from", "pile"])),
         ),
-        "x.baseline.json": Writer("cli/commands/check.py", lambda path: check.write(path, NUMBERS)),
+        "x.baseline.json": Writer(
+            "results/baseline.py", lambda path: baseline.write(path, NUMBERS)
+        ),
         "planned.toml": Writer(
             "study/sizing/choice.py",
             lambda path: put_into(path, tables(Candidate("verlet", 0.02))),
@@ -127,7 +130,9 @@ def writers(sources: Path) -> dict[str, Writer]:
     return table | {f"z{end}": Writer("view/page.py", partial(page, ball)) for end in PAGE_NAMES}
 
 
-NUMBERS = check.Numbers(run=check.Recipe(cells=None, steps=1), counts={}, scales={}, numbers={})
+NUMBERS = baseline.Numbers(
+    run=baseline.Recipe(cells=None, steps=1), counts={}, scales={}, numbers={}
+)
 NAMES = [*writers(Path())]
 # writers that never end a run or need a run to be called; they use the same function
 NOT_TRIED = {"app/summary.py", "app/exported_systems.py", "cli/commands/series.py"}

@@ -20,7 +20,7 @@ from study_files import (
 
 from msmpetsc.study.cases import shown_command
 from msmpetsc.study.charts.stability import COLORS, SYMBOLS
-from msmpetsc.study.metrics import MEANING, OUTCOMES, counted, outcome
+from msmpetsc.study.outcomes import MEANING, OUTCOMES, counted, outcome
 from msmpetsc.study.report import write_report
 from msmpetsc.study.study_file import load_study
 

@@ -8,7 +8,7 @@ from pandas import DataFrame
 
 from msmpetsc.study import formatting
 from msmpetsc.study.charts.plot import INK, Axes, Chart, CurveStyle, channel, tips
-from msmpetsc.study.metrics import MEANING, OUTCOMES
+from msmpetsc.study.outcomes import MEANING, OUTCOMES
 from msmpetsc.study.table import Row, grouped, mapped, records
 
 CAPTION = (

@@ -190,6 +190,6 @@ def refuse_open(table: OfBody, edges: SurfacePart, lattice: Lattice) -> None:
     if bad:
         raise InputError(
             f"{table.key}.region: the surface in it is open ({of_all} edges, {bad} of them free "
-            "to move), and a pressure needs a closed one, or pins that hold its edge or keep it in "
-            "its plane; a traction may act on any"
+            "to move), and a pressure needs a closed surface, or pins that hold its edge or "
+            "keep it in its plane; a traction may act on any surface"
         )

@@ -150,8 +150,8 @@ def refuse_unlike_frame(path: Path, number: int, is_frame: bool) -> None:
     is_near = distance.max() <= largest and np.median(distance) <= median
     if not (is_near and step.max() <= in_step):
         raise InputError(
-            f"{path} is damaged: its checkpoint's positions are {distance.max():.3g} m from those "
-            f"of frame {number}, and moved by {step.max():.3g} m in a step"
+            f"{path} is damaged: its checkpoint's positions are {distance.max():.3g} m from the "
+            f"positions of frame {number}, and moved by {step.max():.3g} m in a step"
         )
 
 

@@ -39,7 +39,7 @@ ROBUST = "newton-projected"
 # prefix of the PETSc options of the fallback solver
 PREFIX = "fallback_"
 # safety.on_failure -> description in messages
-WORDS = {"substep": "taken in shorter ones", "fallback": f"solved by {ROBUST}"}
+WORDS = {"substep": "taken in shorter steps", "fallback": f"solved by {ROBUST}"}
 
 # tables of the scene, prefix of the PETSc options -> integrator
 MakeIntegrator = Callable[[Time, Solver, str], Integrator]

@@ -84,7 +84,7 @@ def refuse_bad_options(
     if rolls and not all(preset.true_hessian for preset, _ in solvers.values()):
         raise InputError(
             f"{rolls[0]}.fix: single components need one of newton's presets, not "
-            f"{scene.solver.preset}: the matrix A of the others holds whole nodes"
+            f"{scene.solver.preset}: the matrix A of other presets holds whole nodes"
         )
     if scene.time.error and true_error:
         raise InputError("true errors need steps of constant length: leave out time.error")

@@ -240,7 +240,7 @@ def test_ranks_agree(tmp_path: Path):
     [
         (
             {"box": [[-1, -1, -0.2], [1.5, 1.5, 0.01]]},
-            "obstacle: one of the barrier cuts a body at rest, at (",
+            "obstacle: a surface with a barrier cuts a body at rest, at (",
         ),
         ({"box": [[-1, -1, -0.2], [1.5, 1.5, -1e-9]]}, "from a body at rest"),
         (

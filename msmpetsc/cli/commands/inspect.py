@@ -37,7 +37,7 @@ MOST_BUILT = 200_000
 # largest number of ranks [-]; far above any machine
 MOST_RANKS = 10**6
 GB = 1e9
-SPRINGS = "springs; of a rank, shared ones too"
+SPRINGS = "springs; of a rank, with shared springs"
 # width of the first column [characters]
 WIDTH = 36
 # limit on cells of the counted lattice [-]; cages.max_cells is for runs only

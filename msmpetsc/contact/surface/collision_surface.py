@@ -151,12 +151,13 @@ def _refuse_touching(surface: CollisionSurface) -> None:
     cut = barrier.crossings()
     if len(cut):
         raise InputError(
-            f"obstacle: one of the barrier cuts a body at rest, at {_place(whole, cut[0])} m"
+            f"obstacle: a surface with a barrier cuts a body at rest, at {_place(whole, cut[0])} m"
         )
     near = barrier.contacts(barrier.candidates(whole.points, 0.0), whole.points)
     if (least := barrier.least(near, whole.points)) < NEAREST * law.distance:
         raise InputError(
-            f"obstacle: one of the barrier is but {least:.2g} m from a body at rest: leave a gap"
+            f"obstacle: a surface with a barrier is {least:.2g} m from a body at rest: "
+            "leave a wider gap"
         )
 
 
@@ -240,9 +241,9 @@ def _warn_of_long_triangles(longest: float, length: float) -> None:
     """
     if longest > LONG * length:
         log.warning(
-            "self_contact: a triangle is %.2g m long in cells of %.2g m: what bulges between its "
-            "points may pass unseen; mesh.prepare = [{ refine = 0.05 }] splits those longer than a "
-            "twentieth of the body",
+            "self_contact: a triangle is %.2g m long in cells of %.2g m: bulges between its "
+            "corners may pass unseen; mesh.prepare = [{ refine = 0.05 }] splits edges longer than "
+            "a twentieth of the body",
             longest,
             length,
         )

@@ -441,8 +441,8 @@ def _barrier(surface: Surface, collision: CollisionSurface) -> Barrier:
     if folded:
         log.info(
             "self_contact: %d pairs of the surface's parts are in creases, nearer than "
-            "self_contact.distance = %.3g m at rest or next to such: they push each other from "
-            "smaller distances, down to %.3g m",
+            "self_contact.distance = %.3g m at rest or next to such a pair: they push each other "
+            "from smaller distances, down to %.3g m",
             folded,
             law.distance,
             barrier.distances[-1],

@@ -159,6 +159,23 @@ def test_an_error_within_petsc_is_one_line_and_no_crash_when_the_process_ends(
     assert_one_line(done, 2, WITH_THE_SOLVERS[options])
 
 
+# collects garbage as often as Python can
+COLLECTING = """
+import gc, sys
+from msmpetsc.cli.main import main
+gc.set_threshold(1)
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_an_error_within_petsc_survives_a_collection_of_garbage(tmp_path: Path):
+    """Since Python 3.12 a collection in petsc4py's error handler discards the exception."""
+    options = "-pc_type composite"
+    scene = block_scene(tmp_path, **SCENE)
+    done = run(1, "-c", COLLECTING, "run", scene, "-o", tmp_path / "o.h5", *options.split())
+    assert_one_line(done, 2, WITH_THE_SOLVERS[options])
+
+
 FRAMES = "import sys, msmpetsc; list(msmpetsc.frames(sys.argv[1], petsc_options=sys.argv[2]))"
 
 

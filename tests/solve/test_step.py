@@ -1,5 +1,6 @@
 """A single step: against closed forms, against dense linear algebra, and preset against preset."""
 
+import gc
 from dataclasses import replace
 
 import numpy as np
@@ -165,6 +166,14 @@ def test_a_fault_of_ours_within_petsc_is_no_bad_option():
         x = PETSc.Vec().createMPI(2, comm=COMM)
         snes.setFunction(fault, x.duplicate())
         snes.solve(None, x)
+
+
+def test_garbage_is_collected_again_after_the_outermost_block():
+    with petsc_errors("outer"):
+        with petsc_errors("inner"):
+            assert not gc.isenabled()
+        assert not gc.isenabled()
+    assert gc.isenabled()
 
 
 def test_a_preset_leaves_no_options_behind():

@@ -1,6 +1,7 @@
 """PETSc's C functions that petsc4py lacks, and PETSc errors as InputError of a single line."""
 
 import ctypes
+import gc
 import re
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -105,11 +106,16 @@ def _check(error: int) -> None:
 def petsc_errors(heading: str, abandon: Callable[[], None] = lambda: None) -> Iterator[None]:
     """Turn PETSc errors of the block, or of the decorated function, into an InputError.
 
-    PETSc raises ImportError if an object of type python has no context.
+    PETSc raises ImportError if an object of type python has no context. Python's garbage collector
+    rests meanwhile.
 
     heading : beginning of the message, which ends with PETSc's own message
     abandon : function called after an error
     """
+    collects = gc.isenabled()
+    # Since Python 3.12 garbage may be collected in petsc4py's error handler. That
+    # discards the exception on its way through PETSc, without which petsc4py crashes.
+    gc.disable()
     try:
         yield
     except (PETSc.Error, ImportError) as error:
@@ -121,6 +127,9 @@ def petsc_errors(heading: str, abandon: Callable[[], None] = lambda: None) -> It
             raise cause  # noqa: B904
         abandon()
         raise InputError(f"{heading}: {last_words(cause or error)}") from None
+    finally:
+        if collects:
+            gc.enable()
 
 
 class Owner(Protocol):

@@ -170,16 +170,30 @@ class CorrectionTest:
         if residual <= atol:
             return reasons.CONVERGED_ATOL
         if residual <= rtol * self._first:
+            if its > 0:
+                self._meet_eigenvalues(ksp)
             return reasons.CONVERGED_RTOL
         return reasons.DIVERGED_DTOL if residual >= divtol * self._first else reasons.ITERATING
+
+    def _meet_eigenvalues(self, ksp: PETSc.KSP) -> None:
+        """Note the least Ritz value of the solve so far; k iterations take O(k^2)."""
+        self._least = min(self._least, ksp.computeExtremeSingularValues()[1])
 
     def _accepts(self, ksp: PETSc.KSP, residual: float) -> bool:
         """Return whether the error of x is shown to be acceptable."""
         estimate = self.estimate
-        self._least = min(self._least, ksp.computeExtremeSingularValues()[1])
-        estimate.measure(ksp, residual, 0.0 if self._has_contact else self._least)
-        self.is_accepted = estimate.correction_norm + estimate.missing <= self._acceptable
-        if estimate.correction_norm > self._acceptable:
-            # The error is greater, so no later iteration shows that it is acceptable
-            self._acceptable = 0.0
+        if not self._is_below(ksp, residual):
+            if estimate.correction_norm > self._acceptable:
+                # The error is greater, so no later iteration shows that it is acceptable
+                self._acceptable = 0.0
+            return False
+        if not self._has_contact:
+            self._meet_eigenvalues(ksp)
+        self.is_accepted = self._is_below(ksp, residual)
         return self.is_accepted
+
+    def _is_below(self, ksp: PETSc.KSP, residual: float) -> bool:
+        """Return whether the error is acceptable by the eigenvalues met so far."""
+        estimate = self.estimate
+        estimate.measure(ksp, residual, 0.0 if self._has_contact else self._least)
+        return estimate.correction_norm + estimate.missing <= self._acceptable

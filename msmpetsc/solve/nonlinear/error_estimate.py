@@ -184,7 +184,7 @@ class CorrectionTest:
         estimate = self.estimate
         if not self._is_below(ksp, residual):
             if estimate.correction_norm > self._acceptable:
-                # The error is greater, so no later iteration shows that it is acceptable
+                # No later iteration shows that the error is acceptable
                 self._acceptable = 0.0
             return False
         if not self._has_contact:

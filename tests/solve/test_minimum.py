@@ -271,11 +271,11 @@ def test_what_cg_has_left_is_no_bound_across_a_kink(
     """Friction and contact make F at the next iterate differ from CG's residual.
 
     Errors of 0.3 and 1.6 were reported as 0.08 and 0.07: 0.27 and 0.04 of them. The report stays an
-    estimate. In a scene a body springs back from an eighth of its length. Its first step reports
-    0.47, 0.76 or over 0.9 of its error, by the path of 70 iterations.
+    estimate. In a scene a body springs back from an eighth of its length. Its steps report from
+    0.47 of their errors on, by the path of 70 iterations. Without a look at F at x - y, 0.27.
     """
     said = shares_said(seed, number, 'solver.preset="newton-multigrid"', *changes)
-    assert said[0] > 1 / 3 and said[1] > 0.6 and said[2] > 0.6
+    assert min(said) > 1 / 3
 
 
 @pytest.mark.parametrize("seed, number, was", [(85, 40, 0.025), (85, 54, 0.078), (86, 115, 0.09)])

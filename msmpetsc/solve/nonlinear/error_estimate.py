@@ -138,25 +138,26 @@ class CorrectionTest:
 
     def __init__(self, estimate: ErrorEstimate, ksp: PETSc.KSP):
         self.estimate, self.is_accepted = estimate, False
-        # Least eigenvalue of P^(-1) H that the step has met, at most 1
+        # Least eigenvalue of P^(-1) H that the step has met, at most 1; 0 with contact
         self._least = 1.0
         self._acceptable = self._first = 0.0
-        self._has_contact = False
         ksp.setComputeSingularValues(True)
         ksp.setConvergenceTest(self)
 
-    def begin_step(self) -> None:
-        """Forget the last step: its eigenvalues, and the error that it accepted."""
-        self._least, self._acceptable = 1.0, 0.0
+    def begin_step(self, has_contact: bool) -> None:
+        """Forget the last step: its eigenvalues, and the error that it accepted.
 
-    def begin(self, acceptable: float, has_contact: bool) -> None:
-        """Begin a solve.
-
-        acceptable  : error [m sqrt(kg)] of x; 0 if the solve does not tell the error
         has_contact : whether H has contact, whose small eigenvalues CG meets late
         """
+        self._least, self._acceptable = 0.0 if has_contact else 1.0, 0.0
+
+    def begin(self, acceptable: float) -> None:
+        """Begin a solve.
+
+        acceptable : error [m sqrt(kg)] of x; 0 if the solve does not tell the error
+        """
         self.estimate.lowest, self.is_accepted = self.estimate.convexity, False
-        self._acceptable, self._has_contact = acceptable, has_contact
+        self._acceptable = acceptable
 
     def __call__(self, ksp: PETSc.KSP, its: int, residual: float) -> PETSc.KSP.ConvergedReason:
         """Return whether a solve ends (the convergence test of KSP)."""
@@ -176,8 +177,12 @@ class CorrectionTest:
         return reasons.DIVERGED_DTOL if residual >= divtol * self._first else reasons.ITERATING
 
     def _meet_eigenvalues(self, ksp: PETSc.KSP) -> None:
-        """Note the least Ritz value of the solve so far; k iterations take O(k^2)."""
-        self._least = min(self._least, ksp.computeExtremeSingularValues()[1])
+        """Note the least Ritz value of the solve so far; k iterations take O(k^2).
+
+        Once it is not positive, no eigenvalue bounds the error.
+        """
+        if self._least > 0:
+            self._least = min(self._least, ksp.computeExtremeSingularValues()[1])
 
     def _accepts(self, ksp: PETSc.KSP, residual: float) -> bool:
         """Return whether the error of x is shown to be acceptable."""
@@ -187,13 +192,12 @@ class CorrectionTest:
                 # No later iteration shows that the error is acceptable
                 self._acceptable = 0.0
             return False
-        if not self._has_contact:
-            self._meet_eigenvalues(ksp)
+        self._meet_eigenvalues(ksp)
         self.is_accepted = self._is_below(ksp, residual)
         return self.is_accepted
 
     def _is_below(self, ksp: PETSc.KSP, residual: float) -> bool:
         """Return whether the error is acceptable by the eigenvalues met so far."""
         estimate = self.estimate
-        estimate.measure(ksp, residual, 0.0 if self._has_contact else self._least)
+        estimate.measure(ksp, residual, self._least)
         return estimate.correction_norm + estimate.missing <= self._acceptable

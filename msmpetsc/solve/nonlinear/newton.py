@@ -80,7 +80,7 @@ class Newton(StepMethod):
         self.friction.begin(self.functional.problem.contact)
         self.slopes = None
         if self.test:
-            self.test.begin_step()
+            self.test.begin_step(self.functional.problem.contact is not None)
 
     def _create_test(self) -> CorrectionTest | None:
         """Return the test of CG that also tells the error of x; None for other linear solves."""
@@ -194,7 +194,7 @@ class Newton(StepMethod):
         self.ksp.setOperators(self.jacobian.operator)
         if self.test:
             acceptable = outcome.goal * outcome.distance if tells_error else 0.0
-            self.test.begin(acceptable, now.contact is not None)
+            self.test.begin(acceptable)
         self.ksp.solve(now.f, self.y)
         self.jacobian.preconditioner.learn(self.ksp.its, rtol, self._reduction())
         if self.ksp.reason == KSP.DIVERGED_INDEFINITE_MAT:

@@ -21,7 +21,7 @@ from msmpetsc.solve.integrators.static import SLENDER, Static
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.lobpcg import Lobpcg
 from msmpetsc.solve.nonlinear.step import Stepper
-from msmpetsc.solve.petsc.library import keep_for_ever, petsc_errors
+from msmpetsc.solve.petsc.library import petsc_errors
 from msmpetsc.solve.presets import find_preset
 from msmpetsc.solve.simulate import TimeLoop
 
@@ -96,7 +96,7 @@ def _about(
         stepper.set_up()
         functional.begin(replace(problem, q=q, y=q))
         contact = functional.contact_at(q)
-        with petsc_errors("PETSc cannot find modes", lambda: keep_for_ever(stepper)):
+        with petsc_errors("PETSc cannot find modes", stepper):
             stepper.jacobian.hessian.linearise(q, contact)
             stepper.jacobian.preconditioner.prepare(q, contact)
             squares, modes = _lowest(stepper.optimality.curvature.search, count)

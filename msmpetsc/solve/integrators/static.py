@@ -33,7 +33,7 @@ from msmpetsc.solve.multigrid.free_bodies import bodies_of
 from msmpetsc.solve.nonlinear.curvature import NONE, Alarm
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
-from msmpetsc.solve.petsc.library import keep_for_ever, petsc_errors
+from msmpetsc.solve.petsc.library import petsc_errors
 from msmpetsc.solve.recovery import Halving
 from msmpetsc.solve.work import Work
 
@@ -173,7 +173,7 @@ class Static(ImplicitEuler):
         refuse_free_bodies(self.stepper.unknowns)
         self.stepper.set_up()
         optimality, rest = self.stepper.optimality, self.stepper.lattice.nodes
-        with petsc_errors("PETSc cannot set up the solver", lambda: keep_for_ever(self.stepper)):
+        with petsc_errors("PETSc cannot set up the solver", self.stepper):
             optimality.estimate.linearise(rest, None)
             lowest, _ = optimality.curvature.lowest(rest, NONE, Alarm.NOWHERE, None)
         if lowest > 0 and not ACCEPTED_LOWEST[0] <= lowest <= ACCEPTED_LOWEST[1]:

@@ -1,6 +1,5 @@
 """Implicit step: minimise g by a method (solve.presets), then examine the result."""
 
-import ctypes
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 
@@ -209,7 +208,7 @@ class Stepper:
 
         Raises InputError for a preconditioner that this PETSc or matrix does not have.
         """
-        with petsc_errors("PETSc cannot set up the solver", self._abandon):
+        with petsc_errors("PETSc cannot set up the solver", self):
             # Chebyshev's method applies it for eigenvalue bounds
             self.jacobian.hessian.linearise(self.lattice.nodes, None)
             self.jacobian.preconditioner.in_use.prepare(self.lattice.nodes, None)
@@ -224,7 +223,7 @@ class Stepper:
         Raises StepFailed on all ranks, StepStopped after a signal, and InputError if PETSc's
         options contradict each other.
         """
-        with petsc_errors("PETSc cannot take a step with these options", self._abandon):
+        with petsc_errors("PETSc cannot take a step with these options", self):
             self.before = self.work_so_far()
             now, outcome = self._first(self._begin(problem, start), Outcome(self.control.target))
             verdict = self.examine(now, outcome)
@@ -357,11 +356,6 @@ class Stepper:
         if doubted and doubted.doubts > DOUBTS:
             raise no_minimum(doubted, where_worst(self.functional, lower or now))
         return (lower or now, doubted) if doubted else None
-
-    def _abandon(self) -> None:
-        """Keep PETSc's objects for ever: destroying them after an error may crash."""
-        ctypes.pythonapi.Py_IncRef(ctypes.py_object(self))
-        self.owned = ExitStack()
 
     def destroy(self) -> None:
         """Destroy all PETSc objects, in the same order on all ranks (collective)."""

@@ -3,7 +3,7 @@
 import ctypes
 import gc
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import cache
 from typing import Protocol
@@ -102,15 +102,30 @@ def _check(error: int) -> None:
         raise PETSc.Error(error)
 
 
+class Owner(Protocol):
+    """An object that destroys PETSc objects.
+
+    owned : destroys them when closed
+    """
+
+    owned: ExitStack
+
+
+def keep_for_ever(owner: Owner) -> None:
+    """Keep an owner's PETSc objects for ever: destroying them after an error may crash."""
+    ctypes.pythonapi.Py_IncRef(ctypes.py_object(owner))
+    owner.owned = ExitStack()
+
+
 @contextmanager
-def petsc_errors(heading: str, abandon: Callable[[], None] = lambda: None) -> Iterator[None]:
+def petsc_errors(heading: str, owner: Owner | None = None) -> Iterator[None]:
     """Turn PETSc errors of the block, or of the decorated function, into an InputError.
 
     PETSc raises ImportError if an object of type python has no context. Python's garbage collector
     rests meanwhile.
 
     heading : beginning of the message, which ends with PETSc's own message
-    abandon : function called after an error
+    owner   : of PETSc objects in use, which are kept for ever after an error
     """
     collects = gc.isenabled()
     # Since Python 3.12 garbage may be collected in petsc4py's error handler. That
@@ -125,26 +140,12 @@ def petsc_errors(heading: str, abandon: Callable[[], None] = lambda: None) -> It
         cause = error.__cause__
         if cause is not None and not isinstance(cause, (PETSc.Error, ImportError)):
             raise cause  # noqa: B904
-        abandon()
+        if owner:
+            keep_for_ever(owner)
         raise InputError(f"{heading}: {last_words(cause or error)}") from None
     finally:
         if collects:
             gc.enable()
-
-
-class Owner(Protocol):
-    """An object that destroys PETSc objects.
-
-    owned : destroys them when closed
-    """
-
-    owned: ExitStack
-
-
-def keep_for_ever(owner: Owner) -> None:
-    """Keep an owner's PETSc objects for ever: destroying them after an error may crash."""
-    ctypes.pythonapi.Py_IncRef(ctypes.py_object(owner))
-    owner.owned = ExitStack()
 
 
 def last_words(error: BaseException) -> str:

@@ -17,7 +17,6 @@ from msmpetsc.solve.linear.assembled_hessian import assembled, blocks_of, subdom
 from msmpetsc.solve.linear.operators import python_matrix
 from msmpetsc.solve.nonlinear.functional import Iterate
 from msmpetsc.solve.nonlinear.jacobian import Jacobian
-from msmpetsc.solve.nonlinear.preconditioning import MULTIGRID, StepPreconditioner
 from msmpetsc.solve.petsc.library import petsc_errors
 
 # |F - H y| over |F| at which our multigrid is timed, and that of the correction [-]
@@ -109,10 +108,7 @@ def _solved(now: Iterate, jacobian: Jacobian, y: PETSc.Vec) -> dict[str, Any]:
 
     The step's own CG may have another preconditioner, and counts its work.
     """
-    given = jacobian.preconditioner
-    multigrid = StepPreconditioner(
-        given.make_of_matrix, given.make_multigrid, MULTIGRID, False, 0.0
-    )
+    multigrid = jacobian.multigrid()
     ksp = PETSc.KSP().create(jacobian.comm)
     operator = python_matrix(jacobian.unknowns, copy(jacobian.hessian), jacobian.comm)
     ksp.setOperators(operator)

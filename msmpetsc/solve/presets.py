@@ -27,7 +27,6 @@ class Preset:
     iterations   : fixed number of iterations from y, as the method was published. None: iterate to
         the error target from the best of several guesses; linear solves near the end of a step
         then go beyond ksp_rtol
-    chooses      : whether the solver may replace pc_type by multigrid of the Hessian if that pays
     """
 
     about: str
@@ -36,13 +35,13 @@ class Preset:
     projected: int = 0
     start_from_b: bool = False
     iterations: int | None = None
-    chooses: bool = False
 
 
 # largest number of CG iterations in a step and of any counting option; every step ends
 MOST_ITERATIONS = 100_000
 CHOLESKY = {"ksp_type": "preonly", "pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps"}
-JACOBI_CG = {"ksp_type": "cg", "pc_type": "jacobi", "ksp_norm_type": "natural"}
+CG = {"ksp_type": "cg", "ksp_norm_type": "natural"}
+JACOBI_CG = {**CG, "pc_type": "jacobi"}
 # no stop by the length of the correction; the error alone ends a step or a line search
 NO_STOP_BY_SIZE = {"snes_stol": "0"}
 LOCAL_GLOBAL = {
@@ -67,9 +66,10 @@ LATTICE_MULTIGRID = {
     # PETSc's own bound is absolute, but a light body has small pivots.
     "mg_coarse_redundant_pc_factor_zeropivot": "1e-300",
 }
+# without pc_type, which nonlinear.jacobian chooses
 NEWTON = {
     "snes_max_it": NEWTON_ITERATIONS,
-    **JACOBI_CG,
+    **CG,
     "ksp_rtol": "3e-2",
     **LATTICE_MULTIGRID,
 }
@@ -115,11 +115,10 @@ PRESETS = {
         "any error",
         NEWTON,
         true_hessian=True,
-        chooses=True,
     ),
     "newton-multigrid": Preset(
         "Newton's method, always preconditioned by multigrid on the lattice: newton chooses it "
-        "for all but easy steps",
+        "for all but short steps",
         {**NEWTON, "pc_type": "mg"},
         true_hessian=True,
     ),
@@ -129,7 +128,6 @@ PRESETS = {
         NEWTON,
         true_hessian=True,
         projected=100,
-        chooses=True,
     ),
     "fast-msm": Preset(
         "Liu et al. 2013: local/global iterations, ten if no error is given, each a solve with a "

@@ -273,7 +273,7 @@ class Multigrid:
     def _read_options(self) -> None:
         """Read PETSc's options. Raises InputError for a smoother that needs a finest matrix.
 
-        A preset's pc_type may name the first preconditioner of a step instead of the PCMG.
+        The pc_type may name the preconditioner of the steps, beside which a system is exported.
         """
         options = PETSc.Options(self.prefix)
         for name in ("mg_levels_pc_type", f"mg_levels_{len(self.levels)}_pc_type"):

@@ -4,7 +4,7 @@ F vanishes on a saddle of g, too, and a symmetric start never leaves the saddle.
 definite if no spring or cell is compressed enough, which a pass over them tells. Otherwise the
 lowest eigenvalue of M^(-1) H is computed (nonlinear.lobpcg). A long search is made if the
 compression has grown or if a solve has met a negative curvature. At all other steps a few
-iterations follow the last mode, with multigrid only if its curvature has changed.
+iterations follow the last mode if its curvature has changed.
 """
 
 from dataclasses import dataclass
@@ -76,7 +76,7 @@ class LowestCurvature:
 
     All methods but properties are collective.
 
-    preconditioner : of the step's linear solves; it switches to multigrid for a long search
+    preconditioner : of the step's linear solves
     """
 
     state: ClassVar[dict[str, Range]] = {
@@ -158,8 +158,7 @@ class LowestCurvature:
         if lowest is None:
             # After an alarm the next step makes a long search, too
             self.searched = NONE if alarm else compression
-            with self.preconditioner.searching(q, self.functional.contact_at(q)):
-                lowest = self._long_search(q, hint, EFFORT if alarm is Alarm.HERE else self.effort)
+            lowest = self._long_search(q, hint, EFFORT if alarm is Alarm.HERE else self.effort)
         return lowest
 
     def _followed(self) -> tuple[Floats, Rows] | None:

@@ -2,7 +2,7 @@
 
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from mpi4py import MPI
@@ -22,8 +22,9 @@ from msmpetsc.solve.nonlinear.functional import StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import (
     MASSLESS,
     MULTIGRID,
+    STIFF,
     LatticePreconditioner,
-    Preconditioner,
+    MatrixPreconditioner,
     StepPreconditioner,
 )
 from msmpetsc.solve.presets import Preset, SolverOptions
@@ -60,7 +61,6 @@ class Jacobian:
         )
         # Contact's blocks beside A
         self.blocks = None if true_hessian else self._contact_blocks()
-        chooses = self.preset.chooses and options.is_default("pc_type")
         kind = options.value("pc_type")
         if kind == MULTIGRID and not true_hessian:
             raise InputError(
@@ -72,15 +72,26 @@ class Jacobian:
         )
         self.operator = python_matrix(self.unknowns, context, self.comm)
         self.owned.callback(self.operator.destroy)
-        of_lattice = partial(
-            LatticePreconditioner, self.unknowns, elasticity, functional.time_step, options.prefix
+        is_multigrid = kind == MULTIGRID or (true_hessian and not kind and self._is_stiff())
+        self.preconditioner: StepPreconditioner = (
+            self.multigrid() if is_multigrid else self._of_matrix()
         )
-        mass, inertia = (
-            m[self.unknowns.free] for m in (self.unknowns.lattice.mass, self.unknowns.inertia)
-        )
+
+    def _is_stiff(self) -> bool:
+        """Return whether multigrid takes less time than Jacobi's, and rounding leaves mass."""
+        unknowns, mass = self.unknowns, self.unknowns.lattice.mass[self.unknowns.free]
+        inertia = unknowns.inertia[unknowns.free]
         ratio = self.comm.allreduce(greatest((self.diagonal - inertia) / mass), MPI.MAX)
-        chooses = chooses and (self.unknowns.has_fixed or ratio < MASSLESS)
-        self.preconditioner = StepPreconditioner(self._of_matrix, of_lattice, kind, chooses, ratio)
+        return bool(ratio > STIFF and (unknowns.has_fixed or ratio < MASSLESS))
+
+    def multigrid(self) -> LatticePreconditioner:
+        """Return a new multigrid preconditioner of the Hessian."""
+        return LatticePreconditioner(
+            self.unknowns,
+            self.functional.elasticity,
+            self.functional.time_step,
+            self.options.prefix,
+        )
 
     @cached_property
     def matrix(self) -> PETSc.Mat:
@@ -89,13 +100,13 @@ class Jacobian:
         self.owned.callback(matrix.destroy)
         return matrix
 
-    def _of_matrix(self) -> Preconditioner:
+    def _of_matrix(self) -> MatrixPreconditioner:
         matrix = self.matrix
         if self.touches:
             # Contact changes the preconditioner of A, but not A
             matrix = matrix.copy()
             self.owned.callback(matrix.destroy)
-        return Preconditioner(
+        return MatrixPreconditioner(
             matrix, self.unknowns, self.options.prefix, self.functional.time_step, self.touches
         )
 

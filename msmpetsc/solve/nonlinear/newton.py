@@ -196,7 +196,7 @@ class Newton(StepMethod):
             acceptable = outcome.goal * outcome.distance if tells_error else 0.0
             self.test.begin(acceptable)
         self.ksp.solve(now.f, self.y)
-        self.jacobian.preconditioner.learn(self.ksp.its, rtol, self._reduction())
+        self.jacobian.preconditioner.learn(self.ksp.its, rtol)
         if self.ksp.reason == KSP.DIVERGED_INDEFINITE_MAT:
             return replace(outcome, alarm=Alarm.HERE, corrected=False)
         if self.test and self.test.is_accepted:
@@ -222,13 +222,6 @@ class Newton(StepMethod):
         theta = functional.dual_norm(f) / outcome.residual
         functional.vectors.give_back(f)
         return max(1 - theta, 0.0)
-
-    def _reduction(self) -> float:
-        """Return the reduction of the residual by the last linear solve, at least rounding."""
-        norms = self.ksp.getConvergenceHistory()
-        if not len(norms) or norms[-1] >= norms[0]:
-            return 1.0
-        return max(float(norms[-1] / norms[0]), float(np.finfo(float).eps))
 
     def _search(self, now: Iterate, flat: bool) -> Iterate | None:
         """Return the first iterate x - s y of sufficient descent; None if g falls for no s.

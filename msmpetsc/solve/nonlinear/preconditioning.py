@@ -2,21 +2,15 @@
 
 With Jacobi's preconditioner CG takes about sqrt(kappa) / 2 ln(2 / rtol) iterations. In free space
 kappa = 2 (1 + t^2 k / m), k the stiffness of the springs at a node. Multigrid takes about four
-iterations for any kappa, each of them several times as dear. So short steps use Jacobi's until it
-takes more iterations than multigrid is worth. Jacobi's takes a hundred iterations for the lowest
-modes, so a search for them uses multigrid of its own.
+iterations for any kappa, each of them several times as dear. So short steps use Jacobi's
+preconditioner, and all others use multigrid.
 """
-
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Positions, Rows, like
-from msmpetsc.comm import log
 from msmpetsc.contact.step_contact import StepContactAt
 from msmpetsc.contact.surface.surface_contact import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity
@@ -29,22 +23,77 @@ from msmpetsc.solve.petsc.events import CYCLE, GRIDS, HIERARCHY
 
 MULTIGRID = PETSc.PC.Type.MG
 DIRECT = {PETSc.PC.Type.CHOLESKY, PETSc.PC.Type.LU}
-# Iterations of Jacobi's that cost more than a few of multigrid and its set-up
-LONG = 40
-# Usual ksp_rtol
-USUAL = 0.1
+# Greatest t^2 k / m of a node; beyond it multigrid takes less time than Jacobi's
+STIFF = 15.0
+# t^2 k / m beyond which rounding hides the mass, which alone tells where a free body
+# moves
+MASSLESS = 1e9
 # Iterations per digit with a hierarchy of the present positions
 USUAL_RATE = 2.5
 # Iterations that cost as much as a new hierarchy
 WORTH = 10.0
 # Iterations beyond the usual number that a solve with an old hierarchy may take
 PATIENCE = 15.0
-# t^2 k / m beyond which rounding hides the mass, which alone tells where a free body
-# moves
-MASSLESS = 1e9
 
 
-class Preconditioner:
+class StepPreconditioner:
+    """Preconditioner of a step's linear solves (a context of PCPYTHON).
+
+    All methods are collective.
+
+    is_uniform : whether smooth errors converge as fast as oscillating errors
+    pc         : PETSc's preconditioner
+    """
+
+    is_uniform: bool
+    unknowns: Unknowns
+    pc: PETSc.PC
+
+    @property
+    def products(self) -> int:
+        """Products with the Hessian so far."""
+        return 0
+
+    def prepare(self, q: Positions, contact: StepContactAt | None) -> bool:
+        """Prepare for positions q (l, 3) [m]; return whether the preconditioner changed."""
+        raise NotImplementedError
+
+    def most_iterations(self, rtol: float) -> int | None:
+        """Return the most iterations of a solve to a tolerance; None for PETSc's option."""
+        return None
+
+    def learn(self, its: int, rtol: float) -> None:
+        """Count the iterations of a linear solve to a relative tolerance."""
+
+    def forget(self) -> None:
+        """Forget earlier steps."""
+
+    def setFromOptions(self, _: PETSc.PC) -> None:
+        """Take the options -pc_... (PCSetFromOptions calls it)."""
+
+    def setUp(self, _: PETSc.PC) -> None:
+        """Set up the preconditioner (PCSetUp calls it)."""
+        self.pc.setUp()
+
+    def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
+        """Show the preconditioner (PCView calls it)."""
+        self.pc.view(viewer)
+
+    def apply(self, _: PETSc.PC | None, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Write P^-1 x to y (PCApply calls it)."""
+        self._apply(x, y)
+        self.unknowns.project(y)
+
+    def _apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Write P^-1 x to y, fixed components included."""
+        raise NotImplementedError
+
+    def destroy(self, pc: PETSc.PC | None = None) -> None:
+        """Destroy all PETSc objects (PCDestroy calls it)."""
+        raise NotImplementedError
+
+
+class MatrixPreconditioner(StepPreconditioner):
     """Any PETSc preconditioner of A, applied to the three columns of coordinates.
 
     The options -pc_... set it for every preset, since A also preconditions the true Hessian. A
@@ -57,6 +106,8 @@ class Preconditioner:
     added   : (m,) addition to the diagonal, over t^2 [N/m]
     """
 
+    is_uniform = False
+
     def __init__(
         self, matrix: PETSc.Mat, unknowns: Unknowns, prefix: str, time_step: float, touches: bool
     ):
@@ -65,6 +116,7 @@ class Preconditioner:
         self.pc = PETSc.PC().create(matrix.comm)
         self.pc.setOptionsPrefix(prefix)
         self.pc.setOperators(matrix)
+        self.pc.setType(PETSc.PC.Type.JACOBI)
         self.vector = matrix.createVecLeft()
         matrix.getDiagonal(self.vector)
         self.own = unknowns.memory.read(self.vector).copy()
@@ -88,7 +140,10 @@ class Preconditioner:
             self.matrix.setDiagonal(self.vector)
         return changed
 
-    def apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+    def setFromOptions(self, _: PETSc.PC) -> None:
+        self.pc.setFromOptions()
+
+    def _apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Write P^-1 x to y, all three columns in a single call, as MUMPS can."""
         memory = self.unknowns.memory
         if not self.blocks:
@@ -102,14 +157,13 @@ class Preconditioner:
         columns = memory.write(y)
         columns[:] = like(columns, solution.values)
 
-    def destroy(self) -> None:
-        """Destroy all PETSc objects (collective)."""
+    def destroy(self, _: PETSc.PC | None = None) -> None:
         for part in (*self.blocks, self.pc, self.vector):
             part.destroy()
 
 
-class LatticePreconditioner:
-    """Multigrid of the Hessian, its hierarchy kept while it saves time. All methods are collective.
+class LatticePreconditioner(StepPreconditioner):
+    """Multigrid of the Hessian, its hierarchy kept while it saves time.
 
     matrix, pc   : projected Hessian, and PETSc's PCMG of it
     translations : of bodies without fixed nodes, exact while ``is_free``; None if all are fixed
@@ -119,6 +173,8 @@ class LatticePreconditioner:
     is_stale     : whether a new hierarchy is due
     is_new       : whether the hierarchy was built at the positions of the next linear solve
     """
+
+    is_uniform = True
 
     def __init__(self, unknowns: Unknowns, elasticity: Elasticity, time_step: float, prefix: str):
         self.unknowns = unknowns
@@ -131,6 +187,10 @@ class LatticePreconditioner:
         self.rate: float | None = None
         self.excess = 0.0
         self.is_stale, self.is_new, self.is_free = True, False, False
+
+    @property
+    def products(self) -> int:
+        return self.multigrid.fine.products
 
     def prepare(self, q: Positions, contact: StepContactAt | None) -> bool:
         """Build a hierarchy at positions q (l, 3) [m] if it is due; return whether it was."""
@@ -203,7 +263,12 @@ class LatticePreconditioner:
             blocks[nodes] += added.reshape(-1, 9)
         return blocks
 
-    def apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+    def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
+        for line in repr(self.multigrid).splitlines():
+            viewer.printfASCII(f"    {line}\n")
+        self.pc.view(viewer)
+
+    def _apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Write P^-1 x to y by a cycle."""
         with CYCLE:
             if self.translations and self.is_free:
@@ -216,167 +281,10 @@ class LatticePreconditioner:
         self.is_stale = self.is_first = True
         self.multigrid.contact.destroy()
 
-    def destroy(self) -> None:
-        """Destroy all PETSc objects (collective)."""
+    def destroy(self, _: PETSc.PC | None = None) -> None:
         self.multigrid.destroy()
 
 
 def _digits(rtol: float) -> float:
     """Return the digits that a solve to this tolerance gains, at least 0.1."""
     return max(-float(np.log10(rtol)), 0.1)
-
-
-def expected_iterations(ratio: float) -> float:
-    """Return Jacobi's iterations if the greatest t^2 k / m of a node is ``ratio``."""
-    return float(0.5 * np.sqrt(2 * (1 + ratio)) * np.log(2 / USUAL))
-
-
-@dataclass(eq=False)
-class StepPreconditioner:
-    """Preconditioner of a step's solves, of A or of the Hessian (a context of PCPYTHON).
-
-    All methods are collective.
-
-    make_of_matrix, make_multigrid : make the two on first use
-    kind    : -pc_type; multigrid is taken if it is mg
-    chooses : choose between the two by ``ratio`` and by the iterations of solves
-    ratio   : greatest t^2 k / m of a node
-    """
-
-    make_of_matrix: Callable[[], Preconditioner]
-    make_multigrid: Callable[[], LatticePreconditioner]
-    kind: str
-    chooses: bool
-    ratio: float
-
-    def __post_init__(self) -> None:
-        self.is_searching = False
-        self.for_searches: LatticePreconditioner | None = None
-        self.of_matrix: Preconditioner | None = None
-        self.multigrid: LatticePreconditioner | None = None
-        # Whether multigrid is chosen for the steps
-        self.is_chosen = self.kind == MULTIGRID
-        expected = expected_iterations(self.ratio)
-        if self.is_chosen:
-            self.multigrid = self.make_multigrid()
-        elif self.chooses and expected > LONG:
-            self._choose(
-                f"t^2 k / m = {self.ratio:.3g}: "
-                f"Jacobi's would take some {expected:.0f} iterations a solve"
-            )
-        else:
-            self.of_matrix = self.make_of_matrix()
-
-    @property
-    def in_use(self) -> Preconditioner | LatticePreconditioner:
-        """Preconditioner of the steps."""
-        chosen = self.multigrid if self.is_chosen else self.of_matrix
-        assert chosen is not None
-        return chosen
-
-    def prepare(self, q: Positions, contact: StepContactAt | None) -> bool:
-        """Prepare for positions q (l, 3) [m]; return whether the preconditioner changed."""
-        if (
-            self.chooses
-            and not self.is_chosen
-            and contact
-            and contact.surface
-            and contact.surface.presses(q)
-        ):
-            self._choose("the surface presses on itself")
-        return self.in_use.prepare(q, contact)
-
-    @property
-    def is_uniform(self) -> bool:
-        """Whether smooth errors converge as fast as oscillating errors."""
-        return self.is_chosen or self.is_searching
-
-    @property
-    def products(self) -> int:
-        """Products with the Hessian so far, on multigrid's finest level."""
-        return sum(
-            lattice.multigrid.fine.products
-            for lattice in (self.multigrid, self.for_searches)
-            if lattice
-        )
-
-    @contextmanager
-    def searching(self, q: Positions, contact: StepContactAt | None) -> Iterator[None]:
-        """Switch to multigrid, built at positions q (l, 3) [m], for a long search.
-
-        Smooth modes converge last with Jacobi's preconditioner, and at once with multigrid. This
-        hierarchy is separate from the hierarchy of steps.
-        """
-        if self.is_chosen or not self.chooses:
-            yield
-            return
-        self.for_searches = self.for_searches or self.make_multigrid()
-        self.for_searches.is_stale = True
-        self.for_searches.prepare(q, contact)
-        self.is_searching = True
-        try:
-            yield
-        finally:
-            self.is_searching = False
-
-    def _choose(self, reason: str) -> None:
-        self.is_chosen = True
-        # It may have been chosen before and forgotten
-        if self.multigrid is None:
-            log.info(
-                "preconditioner: multigrid on the lattice (%s; -pc_type jacobi keeps to it)", reason
-            )
-            self.multigrid = self.make_multigrid()
-
-    def most_iterations(self, rtol: float) -> int | None:
-        """Return the most iterations of a solve to a tolerance; None for PETSc's option."""
-        return self.multigrid.most_iterations(rtol) if self.multigrid and self.is_chosen else None
-
-    def learn(self, its: int, rtol: float, reached: float) -> None:
-        """Count the iterations of a linear solve.
-
-        rtol    : relative tolerance of the solve
-        reached : reduction of the residual in the natural norm
-        """
-        if self.multigrid and self.is_chosen:
-            self.multigrid.learn(its, rtol)
-        elif self.chooses and its * np.log(2 / USUAL) > LONG * np.log(2 / reached):
-            self._choose(f"Jacobi's took {its} iterations a solve")
-
-    def setFromOptions(self, _: PETSc.PC) -> None:
-        """Take the options -pc_... (PCSetFromOptions calls it)."""
-        if not self.is_chosen:
-            self.in_use.pc.setFromOptions()
-
-    def setUp(self, _: PETSc.PC) -> None:
-        """Set up the preconditioner in use (PCSetUp calls it)."""
-        self.in_use.pc.setUp()
-
-    def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
-        """Show the preconditioner of A, or multigrid and its levels (PCView calls it)."""
-        if self.multigrid and self.is_chosen:
-            for line in repr(self.multigrid.multigrid).splitlines():
-                viewer.printfASCII(f"    {line}\n")
-        self.in_use.pc.view(viewer)
-
-    @property
-    def applied(self) -> Preconditioner | LatticePreconditioner:
-        """Preconditioner of the steps or of the search in progress."""
-        return self.for_searches if self.is_searching and self.for_searches else self.in_use
-
-    def apply(self, _: PETSc.PC | None, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Write P^-1 x to y (PCApply calls it)."""
-        self.applied.apply(x, y)
-        self.applied.unknowns.project(y)
-
-    def forget(self) -> None:
-        """Forget earlier steps, so that a choice by iterations is made anew."""
-        self.is_chosen = self.of_matrix is None
-        if self.multigrid:
-            self.multigrid.forget()
-
-    def destroy(self, _: PETSc.PC) -> None:
-        """Destroy all PETSc objects (PCDestroy calls it)."""
-        for owned in (self.of_matrix, self.multigrid, self.for_searches):
-            if owned:
-                owned.destroy()

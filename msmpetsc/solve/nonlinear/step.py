@@ -198,7 +198,6 @@ class Stepper:
         if self.preset.true_hessian:
             method: Newton | LocalGlobal = Newton(*given)
             self.snes.setPythonContext(method)
-            self.ksp.setConvergenceHistory(reset=True)
         else:
             method = LocalGlobal(*given, self.prefix, self.options.is_given("npc_snes_type"))
         return method
@@ -211,7 +210,7 @@ class Stepper:
         with petsc_errors("PETSc cannot set up the solver", self):
             # Chebyshev's method applies it for eigenvalue bounds
             self.jacobian.hessian.linearise(self.lattice.nodes, None)
-            self.jacobian.preconditioner.in_use.prepare(self.lattice.nodes, None)
+            self.jacobian.preconditioner.prepare(self.lattice.nodes, None)
             self.ksp.setOperators(self.jacobian.operator)
             self.ksp.setUp()
 

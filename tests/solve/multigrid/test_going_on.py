@@ -11,7 +11,7 @@ from stopped_runs import assert_goes_on_exactly, assert_same
 
 from msmpetsc.solve.multigrid import cycle
 from msmpetsc.solve.nonlinear import preconditioning
-from msmpetsc.solve.nonlinear.preconditioning import LatticePreconditioner, StepPreconditioner
+from msmpetsc.solve.nonlinear.preconditioning import LatticePreconditioner
 
 STEPS = 10
 GRAVITY = {"acceleration": [0.0, 1.0, -9.81]}
@@ -49,7 +49,6 @@ CASES = {
     "solid, pressed": pressed("newton-multigrid", material=SOFT | {"law": "neo-hookean"}),
     "bdf2, pressed": pressed("newton-multigrid", time=BDF2),
     "led and let go": scene("newton-multigrid", pin=HELD, anchor=LED),
-    "switched, pressed": pressed("newton"),
     "fallback": pressed(
         "fast-msm", safety={"on_failure": "fallback"}, start={"velocity": [0.1, 0, -10.0]},
         solver={"preset": "fast-msm", "error": 1e-6},
@@ -59,16 +58,13 @@ CASES = {
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Several coarse levels; hierarchies that are given up soon; newton that changes over after a
-    few steps."""
+    """Several coarse levels; hierarchies that are given up soon."""
     monkeypatch.setattr(cycle, "COARSEST", 10)
     monkeypatch.setattr(preconditioning, "WORTH", 1.0)
-    monkeypatch.setattr(preconditioning, "LONG", 4)
-    monkeypatch.setattr(preconditioning, "expected_iterations", lambda ratio: 0.0)
 
 
 # each case takes some five seconds
-QUICK = {"solid, pressed", "switched, pressed", "fallback"}
+QUICK = {"solid, pressed", "fallback"}
 
 
 @pytest.mark.parametrize(
@@ -78,16 +74,13 @@ QUICK = {"solid, pressed", "switched, pressed", "fallback"}
 def test_a_step_from_a_checkpoint_is_the_step_of_the_whole_run(
     tmp_path: Path, case: str, monkeypatch
 ):
-    """Runs that build hierarchies in some steps only, or change over within a step."""
-    built, chosen, build, choose = [], [], LatticePreconditioner._build, StepPreconditioner._choose
+    """Runs that build hierarchies in some steps only."""
+    built, build = [], LatticePreconditioner._build
     monkeypatch.setattr(
         LatticePreconditioner, "_build", lambda *given: (built.append(1), build(*given))[1]
     )
-    monkeypatch.setattr(
-        StepPreconditioner, "_choose", lambda *given: (chosen.append(1), choose(*given))[1]
-    )
     frames = assert_goes_on_exactly(block_scene(tmp_path, **CASES[case]), every=3)
-    assert len(built) > 1 and (chosen or not case.startswith("switched"))
+    assert len(built) > 1
     assert case != "fallback" or sum(frame.fallbacks for frame in frames) > 0
 
 

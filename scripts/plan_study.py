@@ -148,7 +148,7 @@ def row(scene: str, target: float, plan: Planned | str, limit: float) -> lab.Row
     bounds = [*([] if plan.answer["met"] else ["**not met**"]), why, *plan.answer["bounds"]]
     return asked | {
         "chosen, cells": f"{method.integrator}{step}, {plan.cells}",
-        "expected: cells + time + step": " + ".join(
+        "expected: cells + time": " + ".join(
             f"{100 * value:.2g}%" for value in choice["budget"].values()
         ),
         "true error": None if error is None else f"{100 * error:.2g}%",

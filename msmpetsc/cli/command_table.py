@@ -277,8 +277,8 @@ COMMANDS = {
             SCENE,
             argument(
                 "--surface-error", type=float, metavar="E", default=0.1,
-                help="error of cells, time step and solver together, over the surface's largest "
-                "displacement (0.1)",
+                help="error of cells and time step together, over the surface's largest "
+                "displacement (0.1); steps are solved to a tenth of it",
             ),
             whole("--frames", "N", "number of the scene's steps in a trial (20)", default=20),
             ranks("MPI ranks of the trials (1)"),

@@ -1,12 +1,11 @@
-"""Cheapest split of a surface error among cells, time step and solver, and the resulting plan."""
+"""Cheapest split of a surface error among cells and time step, and the resulting plan."""
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import tomlkit
 
 from msmpetsc.results.disk import write_whole
@@ -16,9 +15,6 @@ from msmpetsc.scene.toml import toml_value
 from msmpetsc.scene.values import IntegratorName
 from msmpetsc.study.cases import scene_tables
 from msmpetsc.study.sizing.orders import ErrorLaw
-
-# largest exponent of the cells in the cost of a step; above it timer noise prevails
-MAX_COST_ORDER = 1.6
 
 
 @dataclass(frozen=True)
@@ -41,26 +37,16 @@ class Stepping:
 
 
 @dataclass(frozen=True)
-class Solving:
-    """A target of the step error: resulting error of the motion [-], cost over the trials' cost."""
-
-    step_error: float | None
-    error: float
-    cost: float
-
-
-@dataclass(frozen=True)
 class Budget:
     """The parts of a surface error, each relative to the largest displacement [-]."""
 
     cells: float
     time: float
-    step: float
 
     @property
     def total(self) -> float:
         """The sum of the parts, an upper bound of the surface error [-]."""
-        return self.cells + self.time + self.step
+        return self.cells + self.time
 
 
 @dataclass(frozen=True)
@@ -75,39 +61,31 @@ class Choice:
 
 @dataclass(frozen=True)
 class CostModel:
-    """Errors and costs of cells, time steps and step errors, extrapolated from the trials.
+    """Errors and costs of cells and time steps, extrapolated from the trials.
 
     law         : error of the cells over the edge of a cell, cells^(-1/3)
     cells       : number of cells of the lattice on which ``steppings`` were tried
-    costs       : cells and cost on each lattice tried, all with the same method, ascending
-    explicit    : whether that method was verlet, whose substeps shrink with the edge of a cell
     least, most : range of cells that may be chosen
     """
 
     law: ErrorLaw
     steppings: Sequence[Stepping]
-    solvings: Sequence[Solving]
     cells: float
-    costs: Sequence[tuple[float, float]]
-    explicit: bool
     least: int
     most: int
 
     def cheapest(self, target: float) -> Choice | None:
         """Return the cheapest choice whose parts sum to at most ``target``, or None."""
         choices = [
-            self.choice(stepping, solving, cells)
+            self.choice(stepping, cells)
             for stepping in self.steppings
-            for solving in self._solvings(stepping)
-            if (cells := self.cells_for(target - stepping.error - solving.error)) <= self.most
+            if (cells := self.cells_for(target - stepping.error)) <= self.most
         ]
         return min(choices, key=lambda choice: choice.cost, default=None)
 
     def best(self) -> Choice:
         """Return the choice of least error, at any cost."""
-        stepping = min(self.steppings, key=lambda each: each.error)
-        solving = min(self._solvings(stepping), key=lambda each: each.error)
-        return self.choice(stepping, solving, self.most)
+        return self.choice(min(self.steppings, key=lambda each: each.error), self.most)
 
     def cells_for(self, error: float) -> float:
         """Return the fewest cells whose error is at most ``error``; infinity for an error of 0."""
@@ -117,34 +95,13 @@ class CostModel:
             return self.least
         return max(self.least, math.ceil(self.law.size(error) ** -3))
 
-    def choice(self, stepping: Stepping, solving: Solving, cells: float) -> Choice:
-        """Return the choice of a method, a step error and a number of cells."""
-        budget = Budget(self.law.error(cells ** (-1 / 3)), stepping.error, solving.error)
-        # verlet's substeps grow as 1 / edge; ``costs`` may contain this growth
-        substep_order = (stepping.method.integrator == "verlet") - self.explicit
-        growth = self.growth(self.cells, cells) * (cells / self.cells) ** (substep_order / 3)
-        cost = stepping.cost * solving.cost * growth
-        method = replace(stepping.method, step_error=solving.step_error)
-        return Choice(method, int(cells), budget, cost)
-
-    def growth(self, before: float, after: float) -> float:
-        """Return the cost at ``after`` cells over that at ``before``, interpolated from trials."""
-        cells, costs = np.log(self.costs).T
-        if len(cells) < 2:
-            return after / before
-        slopes = np.clip(np.diff(costs) / np.diff(cells), 0.0, MAX_COST_ORDER)
-        knots = np.concatenate([[0.0], np.cumsum(slopes * np.diff(cells))])
-        ends = np.log([before, after])
-        # beyond the finest trial, cost grows at least in proportion to the cells
-        beyond = np.maximum(0.0, ends - cells[-1])
-        start, end = np.interp(ends, cells, knots) + max(1.0, slopes[-1]) * beyond
-        return math.exp(end - start)
-
-    def _solvings(self, stepping: Stepping) -> Sequence[Solving]:
-        """Return the step errors that may be chosen with a method; verlet has none."""
-        if stepping.method.integrator == "verlet":
-            return [Solving(None, 0.0, 1.0)]
-        return self.solvings
+    def choice(self, stepping: Stepping, cells: float) -> Choice:
+        """Return the choice of a method and a number of cells."""
+        budget = Budget(self.law.error(cells ** (-1 / 3)), stepping.error)
+        # verlet's substeps grow as 1 / edge
+        order = 4 / 3 if stepping.method.integrator == "verlet" else 1
+        cost = stepping.cost * (cells / self.cells) ** order
+        return Choice(stepping.method, int(cells), budget, cost)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Trial runs of a plan, which measure errors and costs of time steps, step errors and cells."""
+"""Trial runs of a plan, which measure errors and costs of time steps and cells."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -22,7 +22,6 @@ from msmpetsc.study.sizing.choice import (
     CostModel,
     SizePlan,
     SizeTrial,
-    Solving,
     Stepping,
     inverted_bound,
     size_bounds,
@@ -50,8 +49,6 @@ OUT_OF_PHASE = 0.15
 USUAL_ORDER = 1.5
 # difference of the orders of coarser and finer lattices above which one is chance
 ALIKE = 0.5
-# step errors tried in addition to that of the trials
-LOOSE_STEP_ERRORS = (1e-1, 1e-2)
 # time limits of a trial on coarse lattices and on the finest [s]
 TIMEOUT, FINEST_TIMEOUT = 150.0, 900.0
 MAX_CHOICES = 6
@@ -104,8 +101,8 @@ class Sizer:
         # an even number of steps, so that twice the step fits
         self.duration = self.step * max(1, steps if self.is_static else steps // 2 * 2)
         self.halved = [self.step / 2**halving for halving in range(-1, 1 + HALVINGS)]
-        # step error of the trials
-        self.solved = min(1e-3, self.target / 10)
+        # step error of all runs
+        self.solved = min(1e-2, self.target / 10)
         self.bounds: list[str] = []
         self.cell_bound = ""
         self.trials: list[SizeTrial] = []
@@ -133,20 +130,11 @@ class Sizer:
             method = min(accurate, key=self._cost_at_scale).method
         else:
             method = min(steppings, key=lambda each: each.error).method
-        solvings = self._solvings(method, coarse)
         lattices = self._lattices(method)
-        costs = [(each.cells, each.cost) for each in lattices]
         cells = next(each.cells for each in self.trials if each.asked == coarse)
         law = self._law(lattices)
         model = CostModel(
-            law=law,
-            steppings=steppings,
-            solvings=solvings,
-            cells=cells,
-            costs=costs,
-            explicit=method.integrator == "verlet",
-            least=1,
-            most=REFINEMENT**3 * self.cells,
+            law=law, steppings=steppings, cells=cells, least=1, most=REFINEMENT**3 * self.cells
         )
         wanted = model.cheapest(AIM * self.target)
         finest = lattices[-1]
@@ -166,7 +154,7 @@ class Sizer:
         plan, model = self._refine_choice(model, lattices)
         return replace(plan, bounds=self._bounds(plan, model), tried=self.trials)
 
-    # ---- time step and step error
+    # ---- time step
 
     def _steppings(self, cells: int) -> list[Stepping]:
         """Return methods with the error of their time step; the finest run is taken as exact."""
@@ -271,20 +259,6 @@ class Sizer:
     def _cost_at_scale(self, stepping: Stepping) -> float:
         """Return the cost on the finest lattice, up to a factor that all methods share."""
         return stepping.cost * (REFINEMENT if stepping.method.integrator == "verlet" else 1)
-
-    def _solvings(self, method: Candidate, cells: int) -> list[Solving]:
-        """Return step errors that may be chosen, with the error in the motion due to each."""
-        if method.step_error is None:
-            return [Solving(self.solved, 0.0, 1.0)]
-        base = self._run(method, cells)
-        known: list[Solving] = []
-        tight_error = 0.0
-        for step_error in LOOSE_STEP_ERRORS:
-            if base and (run := self._run(replace(method, step_error=step_error), cells)):
-                error = _distance(run, base)
-                known.append(Solving(step_error, error, run.cost / base.cost))
-                tight_error = error * self.solved / step_error
-        return [*known, Solving(self.solved, tight_error, 1.0)]
 
     # ---- cells
 
@@ -392,7 +366,7 @@ class Sizer:
         """Return a model without a failed choice's cells if they are few, or without its method."""
         if choice.cells < fewest:
             return replace(model, least=fewest)
-        method = self._as_tried(choice.method)
+        method = choice.method
         kept = [each for each in model.steppings if each.method != method]
         self.bounds.append(
             f"the step: {method.integrator} with steps of {method.time_step:g} s "
@@ -409,7 +383,7 @@ class Sizer:
         if 1 < run.cells / finest.cells < DISTINCT_CELLS:
             return choice.budget
         # the same method, so that only the cells differ
-        finest = self._run(self._as_tried(choice.method), finest.asked) or finest
+        finest = self._run(choice.method, finest.asked) or finest
         distance = _distance(run, finest)
         if run.edge < finest.edge:
             cells_error = law.measured_finer(distance, run.edge, finest.edge)
@@ -432,10 +406,6 @@ class Sizer:
         return bounds
 
     # ---- runs
-
-    def _as_tried(self, method: Candidate) -> Candidate:
-        """Return a method with the step error of the trials."""
-        return replace(method, step_error=self.solved if method.step_error else None)
 
     def _method(self, integrator: IntegratorName, step: float) -> Candidate:
         """Return an integrator with a time step [s], solved as the trials are."""

@@ -5,8 +5,8 @@
 
 The finer run has 32 times the cells of the choice, or 8 times if that exceeds the time limit. It
 has at least a quarter more cells than the plan's finest trial. Its steps are explicit substeps, or
-a quarter of the choice's step; a static scene remains static. If no choice meets the error, the
-choice of least error is compared. SCENE is a name of the study or a scene file.
+implicit for a quarter of the choice's time error; a static scene remains static. If no choice meets
+the error, the choice of least error is compared. SCENE is a name of the study or a scene file.
 """
 
 import json
@@ -22,7 +22,7 @@ import lab
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.time import STATIC
 from msmpetsc.study.metrics import surface_error
-from msmpetsc.study.sizing.choice import Candidate, overrides, tables
+from msmpetsc.study.sizing.choice import Method, overrides, tables
 
 ERRORS = (0.1, 0.03, 0.01)
 # time limit of a finer run [s]
@@ -31,8 +31,8 @@ LIMIT = 900.0
 FINER = (32, 8)
 # least ratio of cells to the plan's finest trial
 MORE = 1.25
-# ratio of implicit steps of the choice and of the finer run
-SHORTER = 4
+# ratio of time errors of the choice and of the finer run
+TIGHTER = 4
 # exit status of a plan that does not meet the error
 NOT_MET = 3
 FOLDER = lab.OUT / "plan_study"
@@ -64,34 +64,32 @@ class Planned(NamedTuple):
 
     file: Path
     frames: int | None
-    method: Candidate
+    method: Method
     cells: int
     answer: dict
     seconds: float
 
-    def run(self, method: Candidate, cells: int, limit: float) -> lab.Run:
+    def run(self, method: Method, cells: int, limit: float) -> lab.Run:
         """Run the scene with a method and cells, with the surface at the scene's own frames."""
         step = load_scene(self.file).time.step
         changes = overrides(
             self.file, {**tables(method), "cages": {"count": cells, "cell_size": None}}
         )
-        changes += ["output.surface=true", f"output.every={max(1, round(step / method.time_step))}"]
+        changes += ["output.surface=true", "output.every=1"]
         if self.frames:
             changes += [f"time.duration={self.frames * step}"]
         path = FOLDER / f"{self.file.stem}_{cells}_{method.integrator}.h5"
         return lab.run(self.file, path, ["--quiet"], changes, timeout=limit)
 
-    def finer(self) -> Iterator[tuple[int, Candidate]]:
+    def finer(self) -> Iterator[tuple[int, Method]]:
         """Yield cells and methods of finer runs, the finest first."""
         method = self.method
         finest = max(each["cells"] for each in self.answer["tried"])
         if method.integrator == STATIC:
             method = replace(method, step_error=1e-3)
         # verlet's substeps shrink with the cells by themselves
-        elif method.integrator != "verlet":
-            method = Candidate(
-                "bdf2", method.time_step / SHORTER, "newton", min(1e-3, method.step_error or 1e-3)
-            )
+        elif method.time_error:
+            method = replace(method, time_error=method.time_error / TIGHTER)
         for times in FINER:
             yield round(max(times * self.cells, MORE * finest)), method
 
@@ -116,7 +114,7 @@ def planned(file: Path, target: float, frames: int | None, cells: int) -> Planne
     answer = json.loads("{" + log.read_text().rpartition("\n{\n")[2])
     choice = answer["choice"]
     return Planned(
-        file, frames, Candidate(**choice["method"]), choice["cells"], answer, perf_counter() - begin
+        file, frames, Method(**choice["method"]), choice["cells"], answer, perf_counter() - begin
     )
 
 
@@ -142,9 +140,7 @@ def row(scene: str, target: float, plan: Planned | str, limit: float) -> lab.Row
     error, why = true_error(plan, limit)
     method = plan.method
     choice = plan.answer["choice"]
-    step = ""
-    if method.step_error is not None:
-        step = f", {1000 * method.time_step:.3g} ms to {method.step_error:g}"
+    step = f" to {method.time_error:.2g}" if method.time_error else ""
     bounds = [*([] if plan.answer["met"] else ["**not met**"]), why, *plan.answer["bounds"]]
     return asked | {
         "chosen, cells": f"{method.integrator}{step}, {plan.cells}",

@@ -277,8 +277,8 @@ COMMANDS = {
             SCENE,
             argument(
                 "--surface-error", type=float, metavar="E", default=0.1,
-                help="error of cells and time step together, over the surface's largest "
-                "displacement (0.1); steps are solved to a tenth of it",
+                help="error of cells and time steps together, over the surface's largest "
+                "displacement (0.1)",
             ),
             whole("--frames", "N", "number of the scene's steps in a trial (20)", default=20),
             ranks("MPI ranks of the trials (1)"),
@@ -286,9 +286,8 @@ COMMANDS = {
             whole("--cells", "N", "cells of the finest trial (the scene's cages.count)"),
             JSON,
         ),
-        description="Try cell counts, integrators, time steps and step errors on the first frames "
-        "of a scene, and print the cheapest choice that meets the error. Exit status 3: no choice "
-        "meets it.",
+        description="Try integrators and cell counts on the first frames of a scene, and print the "
+        "cheapest choice that meets the error. Exit status 3: no choice meets it.",
         starts_runs=True,
     ),
     "compare": Command(

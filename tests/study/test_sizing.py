@@ -1,5 +1,4 @@
-"""Sizing: errors from runs of several sizes, and the cheapest split of an error among cells and
-time step."""
+"""Sizing: errors from runs of several sizes, and the integrator and cells that a plan chooses."""
 
 # ruff: noqa: F811 (fixtures are imported)
 import json
@@ -25,16 +24,14 @@ from msmpetsc.study.metrics import surface_error
 from msmpetsc.study.sizing import trials
 from msmpetsc.study.sizing.choice import (
     Budget,
-    Candidate,
     Choice,
-    CostModel,
+    Method,
     SizePlan,
-    Stepping,
     overrides,
     put_into,
     tables,
 )
-from msmpetsc.study.sizing.orders import ORDERS, ErrorLaw, cosine_of, error_law
+from msmpetsc.study.sizing.orders import ORDERS, cosine_of, error_law
 from msmpetsc.study.sizing.trials import Asked, Sizer
 from msmpetsc.study.table import Row
 
@@ -98,113 +95,51 @@ def test_lattices_that_err_by_chance(order: float, cosine: float):
     assert cosine_of(0, 1, 1) == 1
 
 
-def stepping(integrator: str, step: float, error: float, cost: float) -> Stepping:
-    return Stepping(Candidate(integrator, step, "newton", 1e-3), error, cost)
-
-
-EULER = [stepping("implicit-euler", 0.01 / 2**k, 0.32 / 2**k, 2.0**k) for k in range(8)]
-BDF2 = [stepping("bdf2", 0.01 / 2**k, 0.08 / 4**k, 2.0**k) for k in range(5)]
-MODEL = CostModel(ErrorLaw(2.0, 2.0), [*EULER, *BDF2], cells=1000, least=100, most=10**6)
-
-
-def test_the_cheapest_split_is_that_of_all_splits():
-    """Whatever else is tried, nothing that meets the error is cheaper."""
-    choice = MODEL.cheapest(0.03)
-    assert choice.budget.total <= 0.03 and choice.method.integrator == "bdf2"
-    assert choice.budget.cells == pytest.approx(2 * choice.cells ** (-2 / 3))
-    for each in MODEL.steppings:
-        for cells in range(100, 40_000, 100):
-            other = MODEL.choice(each, cells)
-            assert other.budget.total > 0.03 or other.cost >= choice.cost
-
-
-def test_a_smaller_error_costs_more_and_none_is_promised_that_cannot_be():
-    costs = [MODEL.cheapest(target).cost for target in (0.1, 0.03, 0.01)]
-    assert costs == sorted(costs) and costs[0] < costs[-1]
-    few = replace(MODEL, most=1000)
-    assert few.cheapest(0.01) is None and few.best().cells == 1000
-    assert few.best().budget.cells == pytest.approx(0.02)
-    assert replace(MODEL, steppings=EULER[:2]).cheapest(0.1) is None
-
-
-def test_explicit_substeps_shorten_with_the_cells():
-    """Eight times the cells need twice the substeps."""
-    for integrator, factor in (("bdf2", 8), ("verlet", 16)):
-        each = stepping(integrator, 0.01, 1e-4, 3.0)
-        assert MODEL.choice(each, 8000).cost == pytest.approx(factor * 3.0)
-
-
 class Bodies:
     """A bench whose runs are formulas.
 
-    The error has parts of cells, of order 1.5, of steps and of their solution.
+    The error has parts of cells, of order 1.5, of time steps and of their solution.
 
-    slow        : whether explicit substeps take too long
-    inverted    : cells inside out at the end, by cells
+    explicit   : whether verlet runs, at a third of the cost of BDF2
+    cell_error : error of a single cell [-]; most: largest error of the cells [-]
+    inverted   : cells inside out at the end, by cells
     """
 
     def __init__(
         self, *, explicit: bool = True, impacts: bool = False, cell_error: float = 1.0,
         most=math.inf,
-        fails=lambda *_: False, slow=lambda substep: False, inverted=lambda cells: 0.0,
+        fails=lambda *_: False, inverted=lambda cells: 0.0,
     ):  # fmt: skip
-        self.explicit, self.impacts, self.cell_error, self.fails = (
-            explicit,
-            impacts,
-            cell_error,
-            fails,
-        )
-        # largest error of the cells [-]
-        self.most = most
-        self.slow, self.inverted = slow, inverted
+        self.explicit, self.impacts, self.cell_error = explicit, impacts, cell_error
+        self.most, self.fails, self.inverted = most, fails, inverted
         # errors by result file
         self.errors: dict[Path, float] = {}
 
     def result_of(self, case: Case) -> Path:
         return Path(case.id)
 
-    def error_of(self, case: Case, cells: int) -> float:
-        t, substep = case.time_step, min(case.time_step, 1e-3)
-        time = {
-            "verlet": 1e4 * substep**2,
-            "bdf2": 400 * t**2,
-            "implicit-euler": 20 * t,
-            "static": 0,
-        }[case.integrator]
+    def error_of(self, method: Method, cells: int) -> float:
+        time = method.time_error or (1e-3 if method.integrator == "verlet" else 0.0)
         stuck = 0.3 * (len(self.errors) % 2) if self.impacts else 0.0
-        return (
-            min(self.most, self.cell_error * cells**-0.5) + time + 0.1 * (case.error or 0) + stuck
-        )
+        of_cells = min(self.most, self.cell_error * cells**-0.5)
+        return of_cells + time + 0.1 * (method.step_error or 0) + stuck
 
     def measure(self, case: Case, keep: bool) -> Row:
         assert keep and case.stores_surface
-        explicit = case.integrator == "verlet"
-        steps = (
-            1 if case.integrator == "static" else max(0.01 / case.time_step, case.time_step / 0.01)
-        )
-        # whole steps, so that frames come at the same times
-        assert steps == pytest.approx(round(steps))
-        if explicit and (not self.explicit or self.slow(case.time_step)):
+        tables = tomllib.loads("\n".join(case.set))
+        time, cells = tables["time"], tables["cages"]["count"]
+        assert time["step"] == case.time_step
+        integrator, solver = time.get("integrator", "implicit-euler"), tables.get("solver", {})
+        explicit = integrator == "verlet"
+        if explicit and not self.explicit:
             return {"status": "timeout", "reason": "took longer than 1 s"}
-        (cells,) = (
-            int(text.partition("count = ")[2].strip(" }"))
-            for text in case.set
-            if text.startswith("cages=")
-        )
-        if self.fails(case.integrator, cells):
+        if self.fails(integrator, cells):
             return {"status": "failed", "reason": "planted"}
-        self.errors[self.result_of(case)] = self.error_of(case, cells)
-        substeps = math.ceil(case.time_step / 1e-3) if explicit else 3
-        cost = 1e-6 * cells * (substeps if explicit else 5) / case.time_step
-        row = {
-            "status": "ok",
-            "reason": "",
-            "cells": float(cells),
-            "time_second": cost,
-            "iterations": substeps - 0.3,
-        }
-        row["inverted"] = self.inverted(cells)
-        return row
+        method = Method(integrator, time.get("error"), solver.get("error"))
+        self.errors[self.result_of(case)] = self.error_of(method, cells)
+        cost = 1e-6 * cells * (1 if explicit else 3) / case.time_step
+        row = {"status": "ok", "reason": "", "cells": float(cells), "time_second": cost}
+        return row | {"inverted": self.inverted(cells)}
 
 
 def sized(tmp_path: Path, monkeypatch, target: float, **bodies) -> tuple[SizePlan, Bodies, list]:
@@ -217,14 +152,6 @@ def sized(tmp_path: Path, monkeypatch, target: float, **bodies) -> tuple[SizePla
     return sizer.plan(), bench, said
 
 
-def case_of(method: Candidate) -> Case:
-    return Case(
-        scene="", file=Path(), content="", set=(), integrator=method.integrator,
-        time_step=method.time_step,
-        error=method.step_error,
-    )  # fmt: skip
-
-
 @pytest.mark.parametrize("explicit", [True, False])
 @pytest.mark.parametrize("target", [0.1, 0.03])
 def test_the_plan_meets_the_error_and_wastes_little(
@@ -233,17 +160,17 @@ def test_the_plan_meets_the_error_and_wastes_little(
     """The choice's own error by the formula is a little below the error asked for."""
     plan, bench, _ = sized(tmp_path, monkeypatch, target, explicit=explicit)
     method, cells = plan.choice.method, plan.choice.cells
-    assert plan.met and not plan.bounds and (explicit or method.integrator != "verlet")
+    assert plan.met and not plan.bounds and (method.integrator == "verlet") == explicit
     # the plan extrapolates measured errors, which are slightly off
-    assert 0.7 * target < bench.error_of(case_of(method), cells) <= 1.01 * target
-    assert plan.choice.budget.total <= target and len(plan.tried) >= 6
+    assert 0.7 * target < bench.error_of(method, cells) <= 1.01 * target
+    assert plan.choice.budget.total <= target and len(plan.tried) >= 4
 
 
 @pytest.mark.parametrize("cell_error", [1.5, 3.7, 5.2])
 def test_the_error_of_a_choice_is_what_is_said(tmp_path: Path, monkeypatch, cell_error: float):
     """Choices of fewer cells than the finest lattice, of nearly as many and of many more."""
     plan, bench, _ = sized(tmp_path, monkeypatch, 0.04, cell_error=cell_error, explicit=False)
-    true = bench.error_of(case_of(plan.choice.method), plan.choice.cells)
+    true = bench.error_of(plan.choice.method, plan.choice.cells)
     assert plan.met and plan.choice.budget.total == pytest.approx(true, rel=0.2)
 
 
@@ -261,7 +188,7 @@ def test_a_choice_is_little_better_than_asked_for_where_lattices_err_by_chance(
 
     (tmp_path / "scene.toml").write_text(SCENE)
     bench = Bodies(explicit=False)
-    monkeypatch.setattr(Bodies, "error_of", lambda self, case, cells: 1.4 * cells ** (-1 / 3))
+    monkeypatch.setattr(Bodies, "error_of", lambda self, method, cells: 1.4 * cells ** (-1 / 3))
     monkeypatch.setattr(trials, "surface_error", distance_between)
     plan = Sizer(tmp_path / "scene.toml", bench, Asked(target, 10, 64_000),
     print).plan()  # fmt: skip
@@ -274,12 +201,8 @@ def test_statics_are_planned_by_their_cells_alone(tmp_path: Path, monkeypatch):
         sys.modules[__name__], "SCENE", SCENE.replace("step = 0.01, duration = 0.1", STATIC)
     )
     plan, bench, _ = sized(tmp_path, monkeypatch, 0.1)
-    assert (
-        plan.met
-        and {each.method.integrator for each in plan.tried} == {"static"}
-        and plan.choice.method.time_step == 1
-    )
-    assert 0.07 < bench.error_of(case_of(plan.choice.method), plan.choice.cells) <= 0.1
+    assert plan.met and {each.method.integrator for each in plan.tried} == {"static"}
+    assert 0.07 < bench.error_of(plan.choice.method, plan.choice.cells) <= 0.1
     monkeypatch.setattr(plan_command, "size_all", lambda *_: plan)
     assert main(["plan", str(tmp_path / "scene.toml"), "--surface-error", "0.1", "--write"]) == 0
     written = load_scene(tmp_path / "scene.toml")
@@ -299,7 +222,7 @@ def test_few_cells_are_tried_first(tmp_path: Path, monkeypatch):
         sizer = Sizer(tmp_path / "scene.toml", bench, Asked(target, 10, 64_000), print)
         plan = sizer.plan()
         assert plan.met and max(each.cells for each in sizer.trials) == finest
-        assert bench.error_of(case_of(plan.choice.method), plan.choice.cells) > 0.7 * target
+        assert bench.error_of(plan.choice.method, plan.choice.cells) > 0.7 * target
 
 
 @pytest.mark.parametrize(("advised", "finest"), [(900, 1000), (3000, 8000), (1e6, 64_000)])
@@ -330,7 +253,7 @@ def test_where_the_error_jumps_the_fewest_cells_beyond_are_taken(tmp_path: Path,
     monkeypatch.setattr(
         Bodies,
         "error_of",
-        lambda self, case, cells: cells**-0.5 if cells > 300 else 2 * cells**-0.5,
+        lambda self, method, cells: cells**-0.5 if cells > 300 else 2 * cells**-0.5,
     )
     plan, *_ = sized(tmp_path, monkeypatch, 0.1)
     assert plan.met and 300 < plan.choice.cells < 330
@@ -342,7 +265,7 @@ def test_a_coarsest_lattice_that_is_good_by_chance_takes_no_cells(tmp_path: Path
     plan, bench, _ = sized(tmp_path, monkeypatch, 0.1, cell_error=2.0, most=0.1)
     assert plan.bounds == ["the cells: their distances show no order; order 1.5 is assumed"]
     assert max(each.cells for each in plan.tried) == 6400
-    assert plan.met and bench.error_of(case_of(plan.choice.method), plan.choice.cells) > 0.75 * 0.1
+    assert plan.met and bench.error_of(plan.choice.method, plan.choice.cells) > 0.75 * 0.1
 
 
 def test_no_refusal_without_a_finer_lattice(tmp_path: Path, monkeypatch):
@@ -357,7 +280,7 @@ def test_orders_that_differ_are_assumed_to_be_their_mean(tmp_path: Path, monkeyp
     errors = {100: 0.2, 800: 0.1, 6400: 0.05, 18102: 0.043}
     (tmp_path / "scene.toml").write_text(SCENE)
 
-    def by_cells(bench: Bodies, case: Case, cells: int) -> float:
+    def by_cells(bench: Bodies, method: Method, cells: int) -> float:
         return errors.get(cells, 0.043)
 
     monkeypatch.setattr(Bodies, "error_of", by_cells)
@@ -390,13 +313,6 @@ def test_where_the_coarsest_lattice_fails_a_finer_one_stands_in(tmp_path: Path, 
     assert plan.met and not plan.bounds and {each.cells for each in plan.tried} >= {200, 800, 6400}
 
 
-def test_explicit_trials_that_get_too_slow_are_no_part_of_the_answer(tmp_path: Path, monkeypatch):
-    """The first ends, that with half its substeps does not: BDF2 stands for the true motion."""
-    plan, _, said = sized(tmp_path, monkeypatch, 0.03, slow=lambda step: step < 1e-2)
-    assert "verlet" in {each.method.integrator for each in said if not isinstance(each, str)}
-    assert plan.met and plan.choice.method.integrator in {"bdf2", "implicit-euler"}
-
-
 # by the bound of the error: the target, and properties of the bodies
 BOUNDS = {
     # at most 8 times the cells are allowed, which leaves 1.8e-2
@@ -404,7 +320,7 @@ BOUNDS = {
         1e-2,
         {"cell_error": 4.0},
     ),
-    # shorter steps do not converge
+    # two integrators do not agree
     "the step": (0.1, {"impacts": True}),
     # the trials differ by 0.4, so the usual order is taken
     "the cells: their distances show no order": (
@@ -420,7 +336,7 @@ def test_a_plan_says_what_bounds_the_error(tmp_path: Path, monkeypatch, bound: s
     plan, bench, _ = sized(tmp_path, monkeypatch, target, **bodies)
     assert any(said.startswith(bound) for said in plan.bounds) and plan.met == ("order" in bound)
     if plan.met:
-        assert 0.14 < bench.error_of(case_of(plan.choice.method), plan.choice.cells) <= 0.2
+        assert 0.14 < bench.error_of(plan.choice.method, plan.choice.cells) <= 0.2
     assert bound != "the mesh's cells" or plan.choice.cells == 8 * 6400
 
 
@@ -506,7 +422,7 @@ def test_the_true_error_of_a_plan_of_statics_is_what_was_asked_for(soft_beam: Pa
 
 
 PLAN = SizePlan(
-    Choice(Candidate("bdf2", 0.005, "newton", 1e-2), 4321, Budget(0.05, 0.031), 7.5),
+    Choice(Method("bdf2", 0.005, 1e-2), 4321, Budget(0.05, 0.031), 7.5),
     met=True, bounds=["the step: planted"],
 )  # fmt: skip
 
@@ -519,11 +435,8 @@ def test_the_command_tells_the_answer_and_writes_it(tmp_path: Path, monkeypatch,
     out, written = capsys.readouterr().out, load_scene(path)
     assert "7.5 computing seconds a simulated second" in out and "the step: planted" in out
     assert written.cages.count == 4321 and written.cages.cell_size is None
-    assert (written.time.integrator, written.time.step, written.solver.error) == (
-        "bdf2",
-        0.005,
-        0.01,
-    )
+    assert (written.time.integrator, written.time.error) == ("bdf2", 0.005)
+    assert written.solver.error == 0.01
     assert main(["plan", str(path), "--json"]) == 0
     answer = json.loads(capsys.readouterr().out)
     assert (
@@ -549,11 +462,11 @@ max_iterations = 5
 def test_what_is_written_into_a_scene_keeps_its_comments(tmp_path: Path):
     path = tmp_path / "scene.toml"
     path.write_bytes(COMMENTED.replace("\n", "\r\n").encode())
-    put_into(path, tables(Candidate("implicit-euler", 0.005, "newton", 1e-2)))
-    expected = COMMENTED.replace("step = 0.02 ", "step = 0.005 ").replace("anderson", "newton")
+    put_into(path, tables(Method("implicit-euler", 0.005, 1e-2)))
+    expected = COMMENTED.replace("= 1.0\n", "= 1.0\nerror = 0.005\n").replace("anderson", "newton")
     expected = expected.replace("max_iterations = 5", "error = 0.01").replace("\n", "\r\n")
     assert path.read_bytes().decode() == expected
-    put_into(path, tables(Candidate("verlet", 0.02)))
+    put_into(path, tables(Method("verlet")))
     assert 'integrator = "verlet"' in path.read_text() and "# how" in path.read_text()
 
 
@@ -568,13 +481,11 @@ BEFORE = {
 
 @pytest.mark.parametrize(
     "method",
-    [Candidate("verlet", 0.02), Candidate("implicit-euler", 0.005, "lbfgs", 1e-5)],
+    [Method("verlet"), Method("implicit-euler", 0.005, 1e-5)],
     ids=["explicit", "implicit"],
 )
 @pytest.mark.parametrize("given", BEFORE)
-def test_the_command_of_a_plan_says_what_its_lines_say(
-    tmp_path: Path, given: str, method: Candidate
-):
+def test_the_command_of_a_plan_says_what_its_lines_say(tmp_path: Path, given: str, method: Method):
     """Run with these changes the scene is the same as with the answer written into it."""
     mesh = (
         'mesh.source = "beam.obj"\ncages.count = 10\n'
@@ -586,7 +497,7 @@ def test_the_command_of_a_plan_says_what_its_lines_say(
     put_into(path, tables(method))
     written = load_scene(path)
     assert (changed.time, changed.solver) == (written.time, written.solver)
-    assert changed.time.step == method.time_step and changed.time.integrator == method.integrator
+    assert changed.time.error == method.time_error and changed.time.integrator == method.integrator
 
 
 def test_what_cannot_be_met_is_told_with_status_3_and_not_written(

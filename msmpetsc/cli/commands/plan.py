@@ -15,7 +15,6 @@ from msmpetsc.build import read_bodies
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.cell_size import advised_size, estimated_cells
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.scene.time import STATIC
 from msmpetsc.study.cases import launcher
 from msmpetsc.study.process import Processes
 from msmpetsc.study.runner import Bench
@@ -31,7 +30,7 @@ from msmpetsc.study.sizing.choice import (
 from msmpetsc.study.sizing.trials import Asked, Sizer
 
 NOTHING_MEETS = 3
-HEAD = f"{'integrator':16} {'time step [s]':>13} {'step error':>10} {'cells':>8} {'cost [s/s]':>10}"
+HEAD = f"{'integrator':16} {'time error':>10} {'step error':>10} {'cells':>8} {'cost [s/s]':>10}"
 
 
 def run(args: argparse.Namespace) -> int:
@@ -77,8 +76,7 @@ def size_all(args: argparse.Namespace, target: float) -> SizePlan:
         tempfile.TemporaryDirectory(prefix="msmpetsc-plan-") as folder,
         closing(Processes()) as processes,
     ):
-        # warm processes: only the ratios of the costs matter
-        runs = Bench(Path(folder), processes, warm=True)
+        runs = Bench(Path(folder), processes)
         sizer = Sizer(args.scene, runs, asked, print_size_trial)
         print(HEAD, flush=True)
         return sizer.plan()
@@ -90,12 +88,9 @@ def print_size_trial(trial: SizeTrial | str) -> None:
         print(trial, flush=True)
         return
     method = trial.method
-    goal = "" if method.step_error is None else f"{method.step_error:.1e}"
-    print(
-        f"{method.integrator:16} {method.time_step:13.4g} {goal:>10} "
-        f"{trial.cells:8.0f} {trial.cost:10.3g}",
-        flush=True,
-    )
+    goals = [f"{goal:.1e}" if goal else "" for goal in (method.time_error, method.step_error)]
+    words = f"{method.integrator:16} {goals[0]:>10} {goals[1]:>10}"
+    print(f"{words} {trial.cells:8.0f} {trial.cost:10.3g}", flush=True)
 
 
 def print_size(plan: SizePlan, target: float) -> None:
@@ -107,8 +102,6 @@ def print_size(plan: SizePlan, target: float) -> None:
         else f"\nnothing meets {target:g}; the smallest error within reach:"
     )
     cost = f"{choice.cost:.3g} computing seconds a simulated second"
-    if choice.method.integrator == STATIC:
-        cost = f"{choice.cost * choice.method.time_step:.3g} computing seconds a state"
     print(f"{cost}, surface error {choice.budget.total:.1e}")
     print(f"{'part':16} {'error':>9}")
     for name, error in vars(choice.budget).items():

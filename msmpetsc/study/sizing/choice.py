@@ -1,6 +1,5 @@
-"""Cheapest split of a surface error among cells and time step, and the resulting plan."""
+"""The choice of a plan: integrator, target errors and cells; and the scene file that gets them."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,30 +9,20 @@ import tomlkit
 
 from msmpetsc.results.disk import write_whole
 from msmpetsc.scene.reading import read_toml
-from msmpetsc.scene.time import STATIC
 from msmpetsc.scene.toml import toml_value
 from msmpetsc.scene.values import IntegratorName
-from msmpetsc.study.cases import scene_tables
-from msmpetsc.study.sizing.orders import ErrorLaw
+
+# solver preset of implicit methods; it chooses the preconditioner itself
+PRESET = "newton"
 
 
 @dataclass(frozen=True)
-class Candidate:
-    """An integrator with its time step [s] and, except for verlet, solver preset and step error."""
+class Method:
+    """An integrator with the target errors of its motion and of its steps; None for no target."""
 
     integrator: IntegratorName
-    time_step: float
-    preset: str = ""
+    time_error: float | None = None
     step_error: float | None = None
-
-
-@dataclass(frozen=True)
-class Stepping:
-    """A method tried on a coarse lattice: error of its time step [-], cost [s per simulated s]."""
-
-    method: Candidate
-    error: float
-    cost: float
 
 
 @dataclass(frozen=True)
@@ -53,55 +42,10 @@ class Budget:
 class Choice:
     """A run with its expected error and cost: computing time per simulated time [s/s]."""
 
-    method: Candidate
+    method: Method
     cells: int
     budget: Budget
     cost: float
-
-
-@dataclass(frozen=True)
-class CostModel:
-    """Errors and costs of cells and time steps, extrapolated from the trials.
-
-    law         : error of the cells over the edge of a cell, cells^(-1/3)
-    cells       : number of cells of the lattice on which ``steppings`` were tried
-    least, most : range of cells that may be chosen
-    """
-
-    law: ErrorLaw
-    steppings: Sequence[Stepping]
-    cells: float
-    least: int
-    most: int
-
-    def cheapest(self, target: float) -> Choice | None:
-        """Return the cheapest choice whose parts sum to at most ``target``, or None."""
-        choices = [
-            self.choice(stepping, cells)
-            for stepping in self.steppings
-            if (cells := self.cells_for(target - stepping.error)) <= self.most
-        ]
-        return min(choices, key=lambda choice: choice.cost, default=None)
-
-    def best(self) -> Choice:
-        """Return the choice of least error, at any cost."""
-        return self.choice(min(self.steppings, key=lambda each: each.error), self.most)
-
-    def cells_for(self, error: float) -> float:
-        """Return the fewest cells whose error is at most ``error``; infinity for an error of 0."""
-        if error <= 0:
-            return math.inf
-        if self.law.factor <= 0:
-            return self.least
-        return max(self.least, math.ceil(self.law.size(error) ** -3))
-
-    def choice(self, stepping: Stepping, cells: float) -> Choice:
-        """Return the choice of a method and a number of cells."""
-        budget = Budget(self.law.error(cells ** (-1 / 3)), stepping.error)
-        # verlet's substeps grow as 1 / edge
-        order = 4 / 3 if stepping.method.integrator == "verlet" else 1
-        cost = stepping.cost * (cells / self.cells) ** order
-        return Choice(stepping.method, int(cells), budget, cost)
 
 
 @dataclass(frozen=True)
@@ -110,15 +54,13 @@ class SizeTrial:
 
     asked    : requested number of valid cells; ``cells`` is the lattice's number
     cost     : computing time per simulated time [s/s]
-    substeps : mean number of substeps per step for verlet, of iterations otherwise
     inverted : number of cells that are inverted at the end
     """
 
-    method: Candidate
+    method: Method
     asked: int
     cells: float
     cost: float
-    substeps: float
     inverted: float
     result: Path
 
@@ -143,20 +85,6 @@ class SizePlan:
     tried: list[SizeTrial] = field(default_factory=list)
 
 
-def size_bounds(model: CostModel, target: float, step_known: bool) -> list[str]:
-    """Return a note each for time step and cells if its least error exceeds half the target."""
-    bounds = []
-    best = model.best().budget
-    if best.time > target / 2 and not step_known:
-        bounds.append(f"the step: {best.time:.1e} is left at the shortest step tried")
-    if best.cells > target / 2:
-        wanted = f"half the error asked for would take {model.cells_for(target / 2):.2g}"
-        bounds.append(
-            f"the mesh's cells: {best.cells:.1e} is left with {model.most} cells; {wanted}"
-        )
-    return bounds
-
-
 def inverted_bound(trials: Sequence[SizeTrial], law: str) -> list[str]:
     """Return a note if cells of the finest lattice are inverted, because convergence may fail."""
     finest = max(trials, key=lambda each: each.cells)
@@ -178,13 +106,17 @@ def inverted_bound(trials: Sequence[SizeTrial], law: str) -> list[str]:
 Tables = Mapping[str, Mapping[str, Any]]
 
 
-def tables(method: Candidate) -> Tables:
+def tables(method: Method) -> Tables:
     """Return the tables of a scene that a method determines; None stands for no key."""
-    values = vars(method) | {"substep": None, "error": method.step_error, "max_iterations": None}
-    if method.integrator == STATIC:
-        # a static scene needs no time step
-        del values["time_step"]
-    return scene_tables(values)
+    # the default is left out
+    name = None if method.integrator == "implicit-euler" else method.integrator
+    time = {"integrator": name, "error": method.time_error, "substep": None}
+    if method.integrator == "verlet":
+        return {"time": time}
+    return {
+        "time": time,
+        "solver": {"preset": PRESET, "error": method.step_error, "max_iterations": None},
+    }
 
 
 def overrides(scene: Path, tables: Tables) -> list[str]:

@@ -1,4 +1,4 @@
-"""Trial runs of a plan, which measure errors and costs of time steps and cells."""
+"""Trial runs of a plan, which measure errors and costs of integrators and cells."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -10,38 +10,30 @@ from typing import NamedTuple
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.time import STATIC
-from msmpetsc.scene.toml import toml_value
-from msmpetsc.scene.values import IntegratorName
-from msmpetsc.study.cases import Case, with_tables
+from msmpetsc.scene.toml import overrides_of
+from msmpetsc.study.cases import Case
 from msmpetsc.study.metrics import surface_error
 from msmpetsc.study.runner import Bench
 from msmpetsc.study.sizing.choice import (
     Budget,
-    Candidate,
     Choice,
-    CostModel,
+    Method,
     SizePlan,
     SizeTrial,
-    Stepping,
     inverted_bound,
-    size_bounds,
+    tables,
 )
 from msmpetsc.study.sizing.orders import ORDERS, ErrorLaw, cosine_of, error_law
 
-# solver preset of the trials; it chooses the preconditioner itself
-PRESET = "newton"
 # ratio of cell edges of successive lattices, and of the scene to the finest choice
 REFINEMENT = 2
 # powers of REFINEMENT by which the coarsest lattice is coarsened; the first that runs
 COARSEST_POWERS = (2.0, 5 / 3, 4 / 3)
-IMPLICIT: tuple[IntegratorName, ...] = ("bdf2", "implicit-euler")
-# largest numbers of halvings of the scene's step and of verlet's substeps
-HALVINGS, SUBSTEP_HALVINGS = 6, 3
 # ratio of cells below which the distance of a finer to a coarser lattice is random
 DISTINCT_CELLS = 4
 # least cells of the finest lattice in the first round
 START_CELLS = 1000
-# target / error of the finest step; so that this step stands for the true motion
+# target / error of the motion by implicit steps; so that cells have most of the target
 STEP_MARGIN = 8
 # distance of lattices [-] above which the motions are out of phase and show no order
 OUT_OF_PHASE = 0.15
@@ -96,20 +88,24 @@ class Sizer:
         self.report = report
         self.advised = asked.advised
         self.step = self.as_given.time.step
-        steps = min(asked.frames, self.as_given.time.steps)
         self.is_static = self.as_given.time.integrator == STATIC
-        # an even number of steps, so that twice the step fits
-        self.duration = self.step * max(1, steps if self.is_static else steps // 2 * 2)
-        self.halved = [self.step / 2**halving for halving in range(-1, 1 + HALVINGS)]
+        self.duration = self.step * min(asked.frames, self.as_given.time.steps)
         # step error of all runs
-        self.solved = min(1e-2, self.target / 10)
+        self.solved = min(1e-3, self.target / 10)
+        # whether verlet may be chosen
+        self.explicit = True
         self.bounds: list[str] = []
         self.cell_bound = ""
         self.trials: list[SizeTrial] = []
 
+    @property
+    def most(self) -> int:
+        """Largest number of cells that may be chosen."""
+        return REFINEMENT**3 * self.cells
+
     def plan(self) -> SizePlan:
         """Return the plan from trials, first on few cells. Raises InputError if too few succeed."""
-        most = self.cells
+        finest = self.cells
         ratio = REFINEMENT**3
         # coarse cells lock thin walls, which hides the order of their error
         while self.cells >= ratio * max(START_CELLS, self.advised):
@@ -117,152 +113,67 @@ class Sizer:
         while True:
             self.bounds.clear()
             plan = self._plan_on_lattices()
-            if self.cells >= most or (plan.met and plan.choice.cells <= self.cells / 2):
+            if self.cells >= finest or (plan.met and plan.choice.cells <= self.cells / 2):
                 return plan
-            self.cells = min(most, ratio * self.cells)
+            self.cells = min(finest, ratio * self.cells)
 
     def _plan_on_lattices(self) -> SizePlan:
         """Return the plan from lattices of at most ``cells`` cells."""
-        coarse = self._coarser(1)
-        steppings = self._steppings(coarse)
-        accurate = [each for each in steppings if each.error <= self.target / 2]
-        if accurate:
-            method = min(accurate, key=self._cost_at_scale).method
-        else:
-            method = min(steppings, key=lambda each: each.error).method
+        method, time_error = self._chosen_method(self._coarser(1))
         lattices = self._lattices(method)
-        cells = next(each.cells for each in self.trials if each.asked == coarse)
         law = self._law(lattices)
-        model = CostModel(
-            law=law, steppings=steppings, cells=cells, least=1, most=REFINEMENT**3 * self.cells
-        )
-        wanted = model.cheapest(AIM * self.target)
+        wanted = fewest_cells(law, AIM * self.target - time_error)
         finest = lattices[-1]
         # a choice this near the finest lattice cannot be measured from it
-        is_near = (
-            wanted is not None and finest.cells / 2 < wanted.cells < DISTINCT_CELLS * finest.cells
-        )
+        is_near = finest.cells / 2 < wanted < DISTINCT_CELLS * finest.cells
         # the order determines the error of the finest lattice, which enters all errors
         is_uncertain = not law.observed or _distance(lattices[0], lattices[1]) > OUT_OF_PHASE
         is_too_coarse = law.error(finest.edge) > UNCERTAIN * self.target
         # few cells cannot show that no number of cells is enough
-        if (wanted is None or is_near or (is_uncertain and is_too_coarse)) and (
+        if (wanted > self.most or is_near or (is_uncertain and is_too_coarse)) and (
             finer := self._run(method, self._coarser(-0.5))
         ):
             lattices = [*lattices[-2:], finer]
-            model = replace(model, law=self._law(lattices, law))
-        plan, model = self._refine_choice(model, lattices)
-        return replace(plan, bounds=self._bounds(plan, model), tried=self.trials)
+            law = self._law(lattices, law)
+        plan = self._refine_choice(method, time_error, law, lattices)
+        return replace(plan, bounds=self._bounds(plan, law), tried=self.trials)
 
-    # ---- time step
+    # ---- integrator
 
-    def _steppings(self, cells: int) -> list[Stepping]:
-        """Return methods with the error of their time step; the finest run is taken as exact."""
+    def _chosen_method(self, cells: int) -> tuple[Method, float]:
+        """Return the cheapest method and the error of its time steps [-].
+
+        Verlet, in steps of its stability limit, counts if it is near an implicit run, whose steps
+        are chosen by their error. Their distance is mostly that error, and an upper estimate of
+        verlet's. Raises InputError if no implicit run succeeds.
+        """
         if self.is_static:
             # static states have no error of a time step
-            state = self._run(self._method(STATIC, self.step), cells)
-            if state is None:
-                raise InputError(f"{self.scene}: the trial failed on {cells} cells, see above")
-            return [Stepping(state.method, 0.0, state.cost)]
-        runs, sizes = self._explicit(cells)
-        if not runs:
-            runs, sizes = self._implicit(cells)
-        if len(runs) < 2:
+            return Method(STATIC, step_error=self.solved), 0.0
+        allowed = self.target / STEP_MARGIN
+        methods = (Method(name, allowed, self.solved) for name in ("bdf2", "implicit-euler"))
+        implicit = next(filter(None, (self._run(method, cells) for method in methods)), None)
+        if implicit is None:
             raise InputError(
                 f"{self.scene}: the trials failed on {cells} cells, see above: "
                 "nothing can be compared"
             )
-        finest = runs[-1]
-        remaining = self._remaining_error(runs, sizes)
-        if remaining > self.target / STEP_MARGIN:
-            distance = _distance(runs[-2], finest)
-            self.bounds.append(
-                f"the step: runs of {finest.method.integrator} with the two shortest steps are "
-                f"{distance:.1e} apart"
-            )
-        known = [
-            Stepping(each.method, _distance(each, finest) + remaining, each.cost)
-            for each in runs[:-1]
-        ]
-        known.append(Stepping(finest.method, remaining, finest.cost))
-        explicit = finest.method.integrator == "verlet"
-        # substeps shorter than verlet's stability limit cost more without need
-        candidates = known[:1] if explicit else known
-        for integrator in IMPLICIT:
-            if explicit or integrator != finest.method.integrator:
-                candidates += self._implicit_steppings(
-                    integrator, candidates, finest=finest, remaining=remaining, cells=cells
+        explicit = self._run(Method("verlet"), cells) if self.explicit else None
+        if explicit is not None:
+            distance = _distance(explicit, implicit)
+            if distance > 2 * allowed:
+                self.bounds.append(
+                    f"the step: runs of verlet and {implicit.method.integrator} are "
+                    f"{distance:.1e} apart"
                 )
-        return candidates
-
-    def _explicit(self, cells: int) -> tuple[list[SizeTrial], list[float]]:
-        """Return runs of verlet with halved substeps, and the substeps; none if a run fails."""
-        first = self._run(self._method("verlet", self.step), cells)
-        if first is None:
-            return [], []
-        runs = [first]
-        # a whole number of substeps per step, so that frames have the same times
-        sizes = [self.step / math.ceil(first.substeps)]
-        for _ in range(SUBSTEP_HALVINGS):
-            sizes.append(sizes[-1] / 2)
-            run = self._run(self._method("verlet", sizes[-1]), cells)
-            if run is None:
-                return [], []
-            runs.append(run)
-            if self._remaining_error(runs, sizes) <= self.target / STEP_MARGIN:
-                break
-        return runs, sizes
-
-    def _implicit(self, cells: int) -> tuple[list[SizeTrial], list[float]]:
-        """Return runs of BDF2 with halved steps until the error is small, and the steps."""
-        runs: list[SizeTrial] = []
-        for step in self.halved:
-            run = self._run(self._method("bdf2", step), cells)
-            if run is None:
-                break
-            runs.append(run)
-            sizes = self.halved[: len(runs)]
-            if len(runs) > 2 and self._remaining_error(runs, sizes) <= self.target / STEP_MARGIN:
-                break
-        return runs, self.halved[: len(runs)]
-
-    def _remaining_error(self, runs: list[SizeTrial], sizes: list[float]) -> float:
-        """Return the error of the last run; ``sizes`` are the steps or substeps of the runs."""
-        distances = [_distance(*pair) for pair in pairwise(runs)]
-        return error_law(sizes, distances, ORDERS).error(sizes[-1])
-
-    def _implicit_steppings(
-        self,
-        integrator: IntegratorName,
-        known: list[Stepping],
-        *,
-        finest: SizeTrial,
-        remaining: float,
-        cells: int,
-    ) -> list[Stepping]:
-        """Return runs of an integrator with halved steps, while it may be the cheapest."""
-        steppings: list[Stepping] = []
-        cheapest = min(
-            (self._cost_at_scale(each) for each in known if each.error <= self.target / 2),
-            default=math.inf,
-        )
-        for step in self.halved:
-            run = self._run(self._method(integrator, step), cells)
-            if run is None:
-                break
-            error = _distance(run, finest) + remaining
-            steppings.append(Stepping(run.method, error, run.cost))
-            if error <= self.target / 3 or run.cost > 2 * cheapest:
-                break
-        return steppings
-
-    def _cost_at_scale(self, stepping: Stepping) -> float:
-        """Return the cost on the finest lattice, up to a factor that all methods share."""
-        return stepping.cost * (REFINEMENT if stepping.method.integrator == "verlet" else 1)
+            # its substeps shorten with the edges of cells
+            elif explicit.cost * REFINEMENT < implicit.cost:
+                return explicit.method, distance
+        return implicit.method, allowed
 
     # ---- cells
 
-    def _lattices(self, method: Candidate) -> list[SizeTrial]:
+    def _lattices(self, method: Method) -> list[SizeTrial]:
         """Return runs on three lattices, or on two if the coarsest lattices fail.
 
         A coarse lattice fails, for example, if no node lies in a pin. Raises InputError if fewer
@@ -325,95 +236,87 @@ class Sizer:
         return max(1, round(cells))
 
     def _refine_choice(
-        self, model: CostModel, lattices: Sequence[SizeTrial]
-    ) -> tuple[SizePlan, CostModel]:
+        self, method: Method, time_error: float, law: ErrorLaw, lattices: Sequence[SizeTrial]
+    ) -> SizePlan:
         """Choose, run and measure until the error is a little less than the target.
 
         Each choice lies between cells that met the target and cells that did not, because the error
-        is not monotonic in the cells. Returns the plan, and the model with the cells narrowed.
+        is not monotonic in the cells.
         """
-        law = model.law
         finest = lattices[-1]
         met = None
         finest_error = law.error(finest.edge)
         # (edge, error) of lattices that are fine enough, and too coarse
         fine = [(finest.edge, finest_error)] if finest_error < AIM * self.target else []
         coarse: list[tuple[float, float]] = []
+        least, most = 1, self.most
         for _ in range(MAX_CHOICES):
-            choice = model.cheapest(AIM * self.target) or model.cheapest(self.target)
-            if choice is None:
+            wanted = (fewest_cells(law, share * self.target - time_error) for share in (AIM, 1))
+            cells = next((max(least, cells) for cells in wanted if cells <= most), math.inf)
+            if cells > most:
                 break
-            run = self._run(choice.method, choice.cells)
+            cells = int(cells)
+            run = self._run(method, cells)
             if run is None:
-                model = self._excluding(choice, model, math.ceil(lattices[0].cells))
-                continue
-            measured = self._measured(choice, run, finest, law)
+                if cells < lattices[0].cells:
+                    least = math.ceil(lattices[0].cells)
+                    continue
+                self.bounds.append(f"the step: {method.integrator} fails on finer cells")
+                if method.integrator != "verlet":
+                    break
+                self.explicit = False
+                return self._plan_on_lattices()
+            measured = Budget(self._cells_error(run, finest, law), time_error)
             error = measured.total / self.target
             if error <= 1:
-                met = replace(choice, cost=run.cost, budget=measured)
+                met = Choice(method, cells, measured, run.cost)
                 fine = [(run.edge, measured.cells)]
-                model = replace(model, most=choice.cells - 1)
+                most = cells - 1
             else:
                 coarse = [(run.edge, measured.cells)]
-                model = replace(model, least=choice.cells + 1)
-            if ACCEPTED <= error <= 1 or model.least > model.most / NARROW:
+                least = cells + 1
+            if ACCEPTED <= error <= 1 or least > most / NARROW:
                 break
-            self.report(f"{choice.cells} cells: {measured.total:.1e}, chosen once more")
-            model = replace(model, law=law.through(*coarse, *fine))
-        return SizePlan(met or model.cheapest(self.target) or model.best(), met is not None), model
+            self.report(f"{cells} cells: {measured.total:.1e}, chosen once more")
+            law = law.through(*coarse, *fine)
+        budget = Budget(law.error(self.most ** (-1 / 3)), time_error)
+        cost = finest.cost * self.most / finest.cells
+        return SizePlan(met or Choice(method, self.most, budget, cost), met is not None)
 
-    def _excluding(self, choice: Choice, model: CostModel, fewest: int) -> CostModel:
-        """Return a model without a failed choice's cells if they are few, or without its method."""
-        if choice.cells < fewest:
-            return replace(model, least=fewest)
-        method = choice.method
-        kept = [each for each in model.steppings if each.method != method]
-        self.bounds.append(
-            f"the step: {method.integrator} with steps of {method.time_step:g} s "
-            "fails on finer cells"
-        )
-        return replace(model, steppings=kept or model.steppings)
+    def _cells_error(self, run: SizeTrial, finest: SizeTrial, law: ErrorLaw) -> float:
+        """Return the error of a run's cells, from its distance to the finest lattice.
 
-    def _measured(self, choice: Choice, run: SizeTrial, finest: SizeTrial, law: ErrorLaw) -> Budget:
-        """Return the errors of a choice; its distance to the finest lattice gives the cells' error.
-
-        If the choice is a little finer than the finest lattice, their distance is random and the
+        If the run is a little finer than the finest lattice, their distance is random and the
         expected error stands.
         """
         if 1 < run.cells / finest.cells < DISTINCT_CELLS:
-            return choice.budget
+            return law.error(run.edge)
         # the same method, so that only the cells differ
-        finest = self._run(choice.method, finest.asked) or finest
         distance = _distance(run, finest)
         if run.edge < finest.edge:
-            cells_error = law.measured_finer(distance, run.edge, finest.edge)
-        else:
-            cells_error = law.measured(distance, finest.edge)
-        return replace(choice.budget, cells=cells_error)
+            return law.measured_finer(distance, run.edge, finest.edge)
+        return law.measured(distance, finest.edge)
 
-    def _bounds(self, plan: SizePlan, model: CostModel) -> list[str]:
+    def _bounds(self, plan: SizePlan, law: ErrorLaw) -> list[str]:
         """Return the reasons why the error of a plan is not smaller, or not certain."""
-        inverted = inverted_bound(self.trials, self.as_given.material.law)
-        thin = []
+        bounds = [*self.bounds, *filter(None, [self.cell_bound])]
+        bounds += inverted_bound(self.trials, self.as_given.material.law)
         if plan.choice.cells < self.advised:
-            thin = [
+            bounds.append(
                 f"the cells: on {plan.choice.cells} cells a tenth of a body bends too little; "
                 f"{float(f'{self.advised:.2g}'):.0f} would do"
-            ]
-        bounds = [*self.bounds, *filter(None, [self.cell_bound]), *inverted, *thin]
+            )
         if not plan.met:
-            bounds += size_bounds(model, self.target, bool(self.bounds))
+            half = fewest_cells(law, self.target / 2)
+            bounds.append(
+                f"the mesh's cells: {plan.choice.budget.cells:.1e} is left with "
+                f"{plan.choice.cells} cells; half the error asked for would take {half:.2g}"
+            )
         return bounds
 
     # ---- runs
 
-    def _method(self, integrator: IntegratorName, step: float) -> Candidate:
-        """Return an integrator with a time step [s], solved as the trials are."""
-        if integrator == "verlet":
-            return Candidate(integrator, step)
-        return Candidate(integrator, step, PRESET, self.solved)
-
-    def _run(self, method: Candidate, cells: int) -> SizeTrial | None:
+    def _run(self, method: Method, cells: int) -> SizeTrial | None:
         """Return a trial, run on first use; report a failure and return None."""
         done = next(
             (each for each in self.trials if (each.method, each.asked) == (method, cells)), None
@@ -423,34 +326,38 @@ class Sizer:
         case = self.case(method, cells)
         row = self.bench.measure(case, keep=True)
         if row["status"] != "ok" or not row.get("time_second"):
-            self.report(
-                f"{method.integrator}, step {method.time_step:g} s, {cells} cells: {row['reason']}"
-            )
+            self.report(f"{method.integrator}, {cells} cells: {row['reason']}")
             return None
         inverted = row.get("inverted") or 0.0
         result = self.bench.result_of(case)
-        trial = SizeTrial(
-            method, cells, row["cells"], row["time_second"], row["iterations"], inverted, result
-        )
+        trial = SizeTrial(method, cells, row["cells"], row["time_second"], inverted, result)
         self.trials.append(trial)
         self.report(trial)
         return trial
 
-    def case(self, method: Candidate, cells: int) -> Case:
+    def case(self, method: Method, cells: int) -> Case:
         """Return the case of a method and a number of cells, with output at the scene's frames."""
-        cages = self.as_given.cages.model_dump(exclude_unset=True) | {
-            "count": cells,
-            "cell_size": None,
+        own = tables(method)
+        changes = {
+            **own,
+            "cages": self.as_given.cages.model_dump(exclude_unset=True)
+            | {"count": cells, "cell_size": None},
+            "time": {**own["time"], "step": self.step, "duration": self.duration},
+            "output.every": 1,
+            "output.surface": True,
         }
-        timeout = TIMEOUT if cells < self.cells else FINEST_TIMEOUT
-        case = Case(
-            scene=self.scene.stem, file=self.scene, content="", set=(f"cages={toml_value(cages)}",),
-            ranks=self.ranks, integrator=method.integrator, time_step=method.time_step,
-            preset=method.preset, error=method.step_error, timeout=timeout,
+        return Case(
+            scene=self.scene.stem, file=self.scene, content="", set=tuple(overrides_of(changes)),
+            ranks=self.ranks, integrator=method.integrator, time_step=self.step,
+            timeout=TIMEOUT if cells < self.cells else FINEST_TIMEOUT,
         )  # fmt: skip
-        every = max(1, round(self.step / method.time_step))
-        case = with_tables(case, self.duration, 1, self.as_given, surface=True)
-        return case.changed(f"output.every={every}")
+
+
+def fewest_cells(law: ErrorLaw, error: float) -> float:
+    """Return the fewest cells whose error is at most ``error``; infinity for an error of 0."""
+    if error <= 0:
+        return math.inf
+    return 1 if law.factor <= 0 else max(1, math.ceil(law.size(error) ** -3))
 
 
 def _distance(run: SizeTrial, reference: SizeTrial) -> float:

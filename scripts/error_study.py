@@ -34,6 +34,7 @@ import tomli_w
 import trimesh
 
 from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve.presets import PRESETS
 
 # ratio of estimate to true error below which an estimate is bad
 LEAST = 1 / 3
@@ -181,9 +182,6 @@ def material_of(draw: Draw) -> dict:
 
 def solver_of(draw: Draw) -> dict:
     """Return solver settings with a random preset and a random error or iteration budget."""
-    # imports PETSc, which must not run yet when processes are forked
-    from msmpetsc.solve.presets import PRESETS
-
     preset = str(draw.choice(list(PRESETS)))
     if draw.random() < 0.1:
         return {"preset": preset, "max_iterations": int(draw.integers(1, 20))}
@@ -264,9 +262,7 @@ def measured(seed: int, changes: list[str], kinds: list[str], number: int) -> di
     scene = draw_scene(seed, number, FOLDER / str(seed), kinds[number % len(kinds)])
     result = scene.with_suffix(".h5")
     result.unlink(missing_ok=True)
-    run = lab.run(
-        scene, result, ["--true-error", 1, "--quiet"], changes, timeout=SECONDS, warm=True
-    )
+    run = lab.run(scene, result, ["--true-error", 1, "--quiet"], changes, timeout=SECONDS)
     solver = load_scene(scene).solver
     steps: list = []
     # a run that failed has the steps before the failure

@@ -68,7 +68,6 @@ def run(
     changes: Iterable[str] = (),
     ranks: int = 1,
     timeout: float = DAY,
-    warm: bool = False,
 ) -> Run:
     """Run a scene in a child process and report it on standard error.
 
@@ -76,7 +75,6 @@ def run(
     path    : result file; log and measure file get the same name with another suffix
     words   : options of `msmpetsc run` and of PETSc
     changes : overrides for --set
-    warm    : save the start-up of the program; then times are not comparable
     """
     file = file_of(scene)
     command: list[object] = ["-m", "msmpetsc", "run", file, "-o", path, "--overwrite", *words]
@@ -87,7 +85,7 @@ def run(
     ]
     path.parent.mkdir(parents=True, exist_ok=True)
     print(file.stem, *words, *changes, f"({ranks} ranks)", file=sys.stderr, flush=True)
-    ended = python(command, path.with_suffix(".log"), ranks, timeout, warm)
+    ended = python(command, path.with_suffix(".log"), ranks, timeout)
     if ended.reason:
         print("  failed:", ended.reason, file=sys.stderr)
     return Run(path, ended.reason, ended.status)
@@ -98,13 +96,11 @@ def file_of(scene: str | Path) -> Path:
     return Path(scene) if Path(scene).suffix == ".toml" else SCENES / f"{scene}.toml"
 
 
-def python(
-    words: Iterable[object], log: Path, ranks: int = 1, timeout: float = DAY, warm: bool = False
-) -> Ended:
+def python(words: Iterable[object], log: Path, ranks: int = 1, timeout: float = DAY) -> Ended:
     """Run Python with these arguments to its end; ``log`` gets all output."""
     # study.cases has a launcher, but its import starts PETSc
     launcher = ["mpiexec", "-n", str(ranks)] if ranks > 1 else []
-    return PROCESSES.run([*launcher, sys.executable, *map(str, words)], log, timeout, warm)
+    return PROCESSES.run([*launcher, sys.executable, *map(str, words)], log, timeout)
 
 
 def box(path: Path, sides: Sequence[float] | np.ndarray) -> str:

@@ -15,7 +15,7 @@ from msmpetsc import __version__
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import Scene, load_scene
 from msmpetsc.scene.toml import toml_value
-from msmpetsc.study.forkserver import COLD
+from msmpetsc.study.process import PROGRAM
 from msmpetsc.study.study_file import Axis, Length, Map, MapCase, Study, StudyScene, Sweep
 
 # table and key of the scene file that hold a field of Case
@@ -124,7 +124,7 @@ def command(case: Case, result: Path, measure: Path) -> list[str]:
     """
     name, scene, *rest = run_arguments(case)
     outputs = ["-o", str(result), "--overwrite", "--measure", str(measure)]
-    return [*launcher(case.ranks), *COLD, name, scene, *outputs, *rest]
+    return [*launcher(case.ranks), *PROGRAM, name, scene, *outputs, *rest]
 
 
 def shown_command(case: Case) -> str:

@@ -3,6 +3,7 @@
 import os
 import signal
 import subprocess
+import sys
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -12,8 +13,9 @@ from threading import Lock
 import psutil
 
 from msmpetsc.app.ranks import environment, last_error
-from msmpetsc.study.forkserver import COLD, Forked
 
+# first words of a command that starts the program
+PROGRAM = [sys.executable, "-m", "msmpetsc"]
 # time [s] between SIGTERM and SIGKILL
 GRACE = 3.0
 
@@ -37,16 +39,13 @@ class Processes:
     """The child processes that run at present; after ``close`` no process is started."""
 
     def __init__(self) -> None:
-        self._running: set[subprocess.Popen[bytes] | Forked] = set()
+        self._running: set[subprocess.Popen[bytes]] = set()
         self.stopped = False
         self._lock = Lock()
 
-    def run(self, command: Sequence[str], log: Path, timeout: float, warm: bool = False) -> Ended:
-        """Run a command to its end, or for ``timeout`` seconds, with all output in ``log``.
-
-        warm : fork a command that starts ``msmpetsc`` from a process that has imported it
-        """
-        process = self._start(command, log, warm and list(command[:3]) == COLD)
+    def run(self, command: Sequence[str], log: Path, timeout: float) -> Ended:
+        """Run a command to its end, or for ``timeout`` seconds, with all output in ``log``."""
+        process = self._start(command, log)
         if process is None:
             return Ended(None, "stopped")
         status: int | None = None
@@ -73,25 +72,19 @@ class Processes:
         for process in running:
             end(process)
 
-    def _start(
-        self, command: Sequence[str], log: Path, warm: bool
-    ) -> subprocess.Popen[bytes] | Forked | None:
+    def _start(self, command: Sequence[str], log: Path) -> subprocess.Popen[bytes] | None:
         variables = environment(alone=command[0] != "mpiexec")
         with self._lock, open(log, "w") as out:
             if self.stopped:
                 return None
-            process: subprocess.Popen[bytes] | Forked
-            if warm:
-                process = Forked(command[3:], variables, log)
-            else:
-                process = subprocess.Popen(
-                    command,
-                    stdin=subprocess.DEVNULL,
-                    stdout=out,
-                    stderr=out,
-                    start_new_session=True,
-                    env=variables,
-                )
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=out,
+                start_new_session=True,
+                env=variables,
+            )
             self._running.add(process)
             return process
 
@@ -101,7 +94,7 @@ def too_long(timeout: float) -> str:
     return f"took longer than {timeout:g} s"
 
 
-def end(process: subprocess.Popen[bytes] | Forked) -> None:
+def end(process: subprocess.Popen[bytes]) -> None:
     """End a process and all processes of its session.
 
     A process group is not enough, because mpiexec gives each rank its own group.

@@ -38,15 +38,12 @@ class Bench:
     """Runner of cases in a folder, which keeps the result files of references.
 
     study  : name of the study, a column of the table
-    warm   : fork every case, without imports; points of maps always are, because their
-             times are not reported
     _locks : a lock for each reference, by its id
     """
 
     folder: Path
     processes: Processes
     study: str = ""
-    warm: bool = False
     _locks: dict[str, Lock] = field(default_factory=dict)
 
     def result_of(self, case: Case) -> Path:
@@ -88,8 +85,7 @@ class Bench:
     def _run(self, case: Case, path: Path) -> Ended:
         path.parent.mkdir(parents=True, exist_ok=True)
         words = command(case, path, path.with_suffix(".json"))
-        warm = self.warm or case.point is not None
-        return self.processes.run(words, path.with_suffix(".log"), case.timeout, warm)
+        return self.processes.run(words, path.with_suffix(".log"), case.timeout)
 
     def _reference(self, case: Case) -> tuple[Path | None, str]:
         """Return the result of a case's reference, run on first use; or None and the reason."""

@@ -6,6 +6,8 @@ the environment of the rank. By it a forked child joins the remaining ranks. The
 child does.
 """
 
+import ctypes
+import multiprocessing
 import os
 import runpy
 import signal
@@ -13,15 +15,33 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from importlib import import_module
 from multiprocessing.connection import wait
 from pathlib import Path
+from typing import NoReturn
+from unittest.mock import patch
 
-from msmpetsc.study.forkserver import SERVER, Forked, enter, leave, redirect_output
-
+PROGRAM = "msmpetsc.cli.main"
+SERVER = multiprocessing.get_context("forkserver")
+# the modules that a run imports, except PETSc
+SERVER.set_forkserver_preload(
+    [
+        "preloaded", PROGRAM, "msmpetsc.cli.commands.run", "msmpetsc.app.resume",
+        "msmpetsc.build", "msmpetsc.geometry.readers",
+    ]
+)  # fmt: skip
 STAND_IN = """cd "$0"; env -0 >$OMPI_COMM_WORLD_RANK.new
 mv $OMPI_COMM_WORLD_RANK.new $OMPI_COMM_WORLD_RANK.env
 read -r status <$OMPI_COMM_WORLD_RANK.status; exit $status"""
+
+
+def started(target: Callable, *given) -> multiprocessing.Process:
+    """A forked process; the server imports its modules from the paths of this process."""
+    process = SERVER.Process(target=target, args=given, daemon=True)
+    with patch.dict(os.environ, PYTHONPATH=os.pathsep.join(sys.path)):
+        process.start()
+    return process
 
 
 def run_forked(
@@ -31,15 +51,14 @@ def run_forked(
     subprocess.TimeoutExpired."""
     with tempfile.TemporaryDirectory() as folder:
         out, error = Path(folder, "out"), Path(folder, "error")
-        child = Forked(arguments, environment, out, error)
-        try:
-            status = child.wait(timeout)
-        except subprocess.TimeoutExpired:
+        child = started(_program, list(arguments), os.getcwd(), dict(environment), (out, error))
+        child.join(timeout)
+        if child.exitcode is None:
             # the session, with all processes that the child started
             os.killpg(child.pid, signal.SIGKILL)
-            raise
+            raise subprocess.TimeoutExpired("msmpetsc", timeout)
         return subprocess.CompletedProcess(
-            list(arguments), status, out.read_text(), error.read_text()
+            list(arguments), child.exitcode, out.read_text(), error.read_text()
         )
 
 
@@ -63,13 +82,8 @@ def run_ranks(
             children = []
             try:
                 for rank in range(ranks):
-                    given = (
-                        list(arguments),
-                        streams,
-                        _environment_of(Path(folder, f"{rank}.env"), mpiexec, end),
-                    )
-                    children.append(SERVER.Process(target=_rank, args=given, daemon=True))
-                    children[-1].start()
+                    own = _environment_of(Path(folder, f"{rank}.env"), mpiexec, end)
+                    children.append(started(_rank, list(arguments), streams, own))
                 _hand_on(children, mpiexec, folder, end)
                 mpiexec.wait(max(0.1, end - time.monotonic()))
             finally:
@@ -129,3 +143,47 @@ def _python(arguments: list[str]) -> None:
     # the server has loaded the module, and runpy would warn of it
     sys.modules.pop(rest[0], None)
     runpy.run_module(rest[0], run_name="__main__", alter_sys=True)
+
+
+def _program(
+    arguments: list[str], folder: str, environment: dict[str, str], files: tuple[Path, Path]
+) -> None:
+    enter(folder, environment)
+    redirect_output(files)
+    sys.argv = ["msmpetsc", *arguments]
+    leave(import_module(PROGRAM).main())
+
+
+def enter(folder: str, environment: Mapping[str, str]) -> None:
+    """Make a forked process leader of its own session, with its own environment, and start MPI."""
+    os.setsid()
+    # undo the handlers inherited from the fork server
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_DFL)
+    os.chdir(folder)
+    os.environ.clear()
+    os.environ.update(environment)
+    from mpi4py import MPI
+
+    MPI.Init()
+
+
+def redirect_output(files: Iterable[str | Path]) -> None:
+    """Append standard output and standard error to two files."""
+    for stream, path in enumerate(files, 1):
+        file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+        os.dup2(file, stream)
+        os.close(file)
+
+
+def leave(status: int) -> NoReturn:
+    """Finalise PETSc and MPI, and exit with this status."""
+    from mpi4py import MPI
+
+    from msmpetsc.solve.petsc.initialise import finalise
+
+    finalise()
+    MPI.Finalize()
+    # multiprocessing ends a forked process without C's own flush
+    ctypes.CDLL(None).fflush(None)
+    sys.exit(status)

@@ -1,13 +1,10 @@
-"""The processes of a study: runs that need not start the program, under mpiexec, and with more
-ranks than cores."""
+"""The processes of a study: under mpiexec, and with more ranks than cores."""
 
 import os
 import subprocess
 import sys
 from pathlib import Path
 
-import h5py
-import numpy as np
 import pytest
 from block_scene import block_scene
 from conftest import AS_ROOT, ENVIRONMENT, run
@@ -15,8 +12,7 @@ from study_files import alive
 
 from msmpetsc.cli.commands import doctor
 from msmpetsc.study import process
-from msmpetsc.study.forkserver import COLD
-from msmpetsc.study.process import Ended, Processes, environment
+from msmpetsc.study.process import PROGRAM, Processes, environment
 
 TIME = {"step": 0.01, "duration": 0.1}
 
@@ -26,31 +22,6 @@ def processes():
     found = Processes()
     yield found
     found.close()
-
-
-def carry_out(
-    processes: Processes, path: Path, *words: str, timeout: float = 60, warm: bool = True
-) -> tuple[Ended, str]:
-    """Return how the process ended, and its output."""
-    log = path.with_suffix(".log")
-    ended = processes.run(
-        [*COLD, "run", str(path), "-o", str(path.with_suffix(".h5")), *words], log, timeout, warm
-    )
-    return ended, log.read_text()
-
-
-def test_a_forked_run_is_the_same_run(tmp_path: Path, processes: Processes):
-    path, frames = block_scene(tmp_path, time=TIME, gravity={"acceleration": [0, 0, -9.81]}), []
-    for words, warm in (([], False), (["-ksp_rtol", "1e-5"], True), ([], True)):
-        ended, told = carry_out(processes, path, "--overwrite", *words, warm=warm)
-        assert ended.status == 0, told
-        with h5py.File(path.with_suffix(".h5")) as file:
-            frames.append(file["frames/position"][:])
-            assert (
-                file.attrs["petsc_options"] == " ".join(words)
-                and str(path) in file.attrs["command"]
-            )
-    np.testing.assert_array_equal(frames[2], frames[0])
 
 
 def test_a_process_alone_takes_no_folder_from_others(
@@ -72,7 +43,8 @@ def test_it_is_ended_when_it_takes_too_long(tmp_path: Path, processes: Processes
     began, end = [], process.end
     monkeypatch.setattr(process, "end", lambda one: (began.append(one.pid), end(one)))
     path = block_scene(tmp_path, time={"step": 0.01, "duration": 1000.0})
-    ended, _ = carry_out(processes, path, timeout=3)
+    command = [*PROGRAM, "run", str(path), "-o", str(tmp_path / "x.h5")]
+    ended = processes.run(command, tmp_path / "log", 3)
     assert ended.status is None and "longer than 3 s" in ended.reason
     assert began and not any(map(alive, began))
 

@@ -30,8 +30,7 @@ from msmpetsc.results.baseline import (
 )
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.study.cases import launcher
-from msmpetsc.study.forkserver import COLD
-from msmpetsc.study.process import Processes
+from msmpetsc.study.process import PROGRAM, Processes
 
 # default number of steps [-]; so that a check takes little time
 STEPS = 20
@@ -94,7 +93,7 @@ def numbers_of(scene: Path, recipe: Recipe, ranks: int) -> Numbers:
     with tempfile.TemporaryDirectory(prefix="msmpetsc-numbers-") as folder:
         path = Path(folder) / "run.h5"
         steps = ["--frames", str(recipe.steps), "--error", str(ERROR)]
-        command = [*launcher(ranks), *COLD, "run", str(scene), "-o", str(path), *steps, *words]
+        command = [*launcher(ranks), *PROGRAM, "run", str(scene), "-o", str(path), *steps, *words]
         ended = Processes().run(command, path.with_suffix(".log"), math.inf)
         if ended.reason:
             raise InputError(f"{scene}: the run failed: {ended.reason}")

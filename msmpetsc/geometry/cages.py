@@ -411,12 +411,7 @@ def _slab_triangles(body: BodySurface, grid: Grid, axes: Indices, edges: Indices
     extents = [planes.min(axis=1), planes.max(axis=1)]
     first, last = np.searchsorted(edges[1:], extents, side="right")
     copies = last - first + 1
-    rank = (
-        np.repeat(first, copies)
-        + np.arange(copies.sum())
-        - np.repeat(np.cumsum(copies) - copies, copies)
-    )
-    return Route(body.comm, rank).send(np.repeat(corners, copies, axis=0))
+    return Route(body.comm, ranges(first, copies)).send(np.repeat(corners, copies, axis=0))
 
 
 def marked_cells(corners: Rows, shape: Indices, slab: Slab) -> Indices:

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import solid_runs as study
-import trimesh
 from block_scene import CELL, block_scene
 from conftest import ROOT
 from mpi4py import MPI
@@ -43,17 +42,6 @@ def test_a_relative_box_up_to_one_holds_what_sticks_out(tmp_path, cells):
     # some nodes stick out of the body
     assert nodes[:, 2].max() > sides[2]
     np.testing.assert_array_equal(model.lattice.pinned, nodes[:, 2] >= 0.8 * sides[2] - 1e-9)
-
-
-def test_the_example_of_tables_runs_as_written(tmp_path, monkeypatch):
-    text = (ROOT / "scripts" / "docs" / "pages" / "how-to" / "python.md").read_text()
-    (code,) = (
-        block.split("```")[0] for block in text.split("```python\n")[1:] if "tables = {" in block
-    )
-    trimesh.creation.box((1, 0.2, 0.2)).export(tmp_path / "body.obj")
-    monkeypatch.chdir(tmp_path)
-    exec(code, {})
-    assert (tmp_path / "out" / "of_tables.h5").exists()
 
 
 def test_a_plane_that_grazes_a_body_clamps_what_it_touches(caplog):

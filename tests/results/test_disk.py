@@ -1,4 +1,4 @@
-"""A disk that is full or write-protected: one line and exit status 2.
+"""A disk that is full or write-protected: a line and exit status 2.
 
 The run goes on when there is room.
 """

@@ -1,4 +1,4 @@
-"""Damaged or hostile result files: they are read or refused in one line.
+"""Damaged or hostile result files: they are read or refused in a line.
 
 No file beside them is opened.
 """

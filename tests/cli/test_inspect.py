@@ -12,9 +12,8 @@ from block_scene import DENSITY, YOUNG, block_scene
 from conftest import ROOT, WORKERS, python, run
 from mpi4py import MPI
 
-from msmpetsc.app.memory import BYTES
 from msmpetsc.build import Geometry, build_model, fill_cages, read_bodies
-from msmpetsc.cli.commands.inspect import MOST_BUILT
+from msmpetsc.cli.commands.inspect import BYTES, MOST_BUILT
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice

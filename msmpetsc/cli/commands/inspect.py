@@ -2,6 +2,9 @@
 
 The counts give ranks equal parts of cells and nodes along the Morton curve. The parts of a run,
 made by sampling (geometry.partition.SortedKeys), agree with these within an eighth.
+
+The memory of a rank is the program plus the larger of two peaks: FACTOR times the arrays during
+the assembly of A, and the construction of W.
 """
 
 import argparse
@@ -9,9 +12,9 @@ import json
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.app.memory import memory_of
 from msmpetsc.backend.arrays import Floats
 from msmpetsc.backend.machine import peak_memory
 from msmpetsc.build import read_bodies
@@ -24,6 +27,7 @@ from msmpetsc.geometry.cell_size import (
     estimated_size,
     warn_of_thin_bodies,
 )
+from msmpetsc.geometry.surface import Surface
 from msmpetsc.geometry.thickness import thickness_words
 from msmpetsc.lattice.partition_counts import Partition, count_partition
 from msmpetsc.lattice.region import listed
@@ -37,6 +41,15 @@ MOST_BUILT = 200_000
 # largest number of ranks [-]; far above any machine
 MOST_RANKS = 10**6
 GB = 1e9
+# memory of a rank without arrays [byte]; measured in runs with the preset newton
+PROGRAM = 0.29e9
+# peak memory over the arrays of a rank [-]; measured in runs with the preset newton
+FACTOR = 2.1
+# memory of the lattice for a cell, a node (ghosts included) and a spring [byte]
+BYTES = np.array([145, 43, 24])
+# peak memory for a surface point with 64 weights while W is made [byte]; measured with
+# the embedding "affine"
+BYTES_OF_POINT = 14 * 64 * 8
 SPRINGS = "springs; of a rank, with shared springs"
 # width of the first column [characters]
 WIDTH = 36
@@ -101,6 +114,26 @@ def run(args: argparse.Namespace) -> int:
     else:
         print_counts(report)
     return 0
+
+
+def memory_of(partition: Partition, surfaces: Sequence[Surface], mesh_bytes: float) -> Floats:
+    """Return the estimated memory (R,) of each rank [byte].
+
+    surfaces   : surfaces that the result stores
+    mesh_bytes : memory that reading and preparing the meshes took, on rank 0 [byte]
+    """
+    # PETSc must get its options before it is imported
+    from msmpetsc.solve.linear.operators import assembly_bytes
+    from msmpetsc.solve.linear.unknowns import BYTES_OF_NODE
+
+    nodes = partition.nodes + partition.ghosts
+    springs = partition.springs
+    arrays = BYTES @ np.array([partition.cells, nodes, springs]) + nodes * BYTES_OF_NODE
+    arrays += assembly_bytes(nodes, springs, partition.nonzeros)
+    points = sum(len(surface.points) for surface in surfaces)
+    needed: Floats = PROGRAM + np.maximum(FACTOR * arrays, BYTES_OF_POINT * points / len(nodes))
+    needed[0] = max(needed[0], PROGRAM + mesh_bytes)
+    return needed
 
 
 def counts_of(scene: Scene, partition: Partition) -> dict[str, dict[str, float]]:

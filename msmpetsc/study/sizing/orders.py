@@ -1,13 +1,13 @@
 """Discretisation error by Richardson extrapolation from runs of several sizes.
 
-A size is the edge of a cell or the time step. If the error is e = C size^p, three runs determine p
-and C (Roache 1994, the grid convergence index). The errors are fields. With distance d between a
-coarse run a and a finer run b, and the angle between the fields d and e_b of cosine c,
+A size is the edge of a cell. If the error is e = C size^p, three runs determine p and C (Roache
+1994, the grid convergence index). The errors are fields. With distance d between a coarse run a and
+a finer run b, and the angle between the fields d and e_b of cosine c,
 
     e_a^2 = d^2 + e_b^2 + 2 c d e_b.
 
-Roache's method has c = 1: all errors have the same direction, as errors of time steps do. Errors of
-lattices that do not nest have a random part as well; distances of three lattices determine c.
+Roache's method has c = 1: all errors have the same direction. Errors of lattices that do not nest
+have a random part as well; distances of three lattices determine c.
 """
 
 import math
@@ -16,8 +16,7 @@ from dataclasses import dataclass, replace
 
 from scipy.optimize import brentq
 
-# range of orders accepted: 1 for partly filled boundary cells, 2 for linear cells and
-# for time steps
+# range of orders accepted: 1 for partly filled boundary cells, 2 for linear cells
 ORDERS = (1.0, 2.2)
 # ratio of sizes below which a random part hides the order
 SIMILAR_RATIO = 1.9

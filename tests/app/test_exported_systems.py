@@ -7,7 +7,16 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from block_scene import GROUND, ROUGH_GROUND, block_scene, clamped_beam
+from block_scene import (
+    CLAMP,
+    EPS,
+    GROUND,
+    ROUGH_GROUND,
+    block_scene,
+    clamped_beam,
+    half_space,
+    roller,
+)
 from conftest import ROOT, python, run
 from mpi4py import MPI
 from one_process import command_error, input_error
@@ -89,20 +98,12 @@ TOUCHES = {"self_contact": {"friction": 0.3}}
 STATIC = {"time": {"step": 1.0, "duration": 1.0, "integrator": "static"}}
 
 
-def roller(axis: int, sign: int, at: float) -> dict:
-    """Return a roller that holds a component of the nodes on a face of a block."""
-    normal, point = [0, 0, 0], [0, 0, 0]
-    normal[axis], point[axis] = sign, at - sign * 0.01
-    return {"region": {"half_space": {"point": point, "normal": normal}}, "fix": ["xyz"[axis]]}
-
-
-CLAMP = {"region": {"half_space": {"point": [0.01, 0, 0], "normal": [-1, 0, 0]}}}
 LOW = {"region": {"box": [[0, 0, 0], [1, 1, 0.15]], "relative": True}}
 ARMS = {"region": {"box": [[0, 0, 0.3], [1, 1, 1]], "relative": True}, "fix": ["y"]}
 # The sides of a block on rollers: its top is open, and its edge keeps to the sides
-ROLLERS = {"pin": [roller(0, -1, 0), roller(1, -1, 0), roller(2, -1, 0), roller(0, 1, 0.5),
-                   roller(1, 1, 0.5)]}  # fmt: skip
-TOP = {"half_space": {"point": [0, 0, 0.24], "normal": [0, 0, 1]}}
+SIDES = [roller(axis, 0.5 - EPS, 1) for axis in (0, 1)]
+ROLLERS = {"pin": [*map(roller, range(3)), *SIDES]}
+TOP = half_space(2, 0.24, 1)
 SQUEEZED = {"material": SOLID, "pressure": [{"region": TOP, "value": 3e4}]}
 BLOWN = {"material": SOLID, "pressure": [{"region": {"box": [[-1] * 3, [1] * 3]}, "value": 1e4}]}
 
@@ -171,7 +172,7 @@ def test_ranks_write_the_same_system(tmp_path: Path, loads: dict):
     """Two ranks, and the sum of their subdomains, with an end on rollers."""
     # Steps so short that the first guess is free fall on any number of ranks
     short = {"material": SOLID, "time": {"step": 0.01, "duration": 0.01}} | loads
-    path = clamped_beam(tmp_path, pin=[CLAMP, roller(0, 1, 1.0)], **short)
+    path = clamped_beam(tmp_path, pin=[CLAMP, roller(0, 1 - EPS, 1)], **short)
     for ranks in (1, 2):
         words = ["--export", tmp_path / str(ranks), "--frames", 1, "--quiet"]
         run(ranks, "-m", "msmpetsc.cli.main", "run", path, "-o", tmp_path / f"{ranks}.h5", *words,

@@ -5,12 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import SIDES, block_scene, play
+from block_scene import CLAMP, EPS, SIDES, block_scene, half_space, play, roller
 from conftest import result_on
 from one_process import command_error
 from scipy.optimize import fsolve
 
-EPS = 1e-3
 SOLID = {"young_modulus": 1e5, "density": 1000.0, "law": "neo-hookean", "poisson_ratio": 0.3}
 MU, LAMBDA = 1e5 / 2.6, 3e4 / (1.3 * 0.4)
 HALF = SIDES * [1, 0.5, 1]
@@ -18,20 +17,8 @@ MULTIGRID = {"preset": "newton-multigrid", "error": 1e-10}
 JACOBI = {"preset": "newton", "error": 1e-10}
 
 
-def side(axis: int, at: float, normal: int) -> dict:
-    """The half space beyond ``at`` along an axis."""
-    point, along = np.zeros((2, 3))
-    point[axis], along[axis] = at, normal
-    return {"half_space": {"point": point.tolist(), "normal": along.tolist()}}
-
-
-def roller(axis: int, at: float = EPS, normal: int = -1) -> dict:
-    return {"region": side(axis, at, normal), "fix": ["xyz"[axis]]}
-
-
-CLAMP = {"region": side(0, EPS, -1)}
 LIFT = {
-    "region": side(0, 0.5 - EPS, 1),
+    "region": half_space(0, 0.5 - EPS, 1),
     "fix": ["z"],
     "path": [{"time": 0.02, "by": [9, 9, 0.02]}],
     "stop": 0.03,
@@ -130,7 +117,7 @@ def test_forces_on_a_held_body_that_lies_on_a_barrier_add_up(tmp_path: Path):
 def test_plane_strain_has_the_stretches_of_its_closed_form(tmp_path: Path, solver: dict):
     """A slab between two smooth walls, pulled along x by 20% of Young's modulus."""
     pull = 2e4
-    force = {"region": side(0, 0.5 - EPS, 1), "total": [pull * 0.125, 0, 0]}
+    force = {"region": half_space(0, 0.5 - EPS, 1), "total": [pull * 0.125, 0, 0]}
     scene = block_scene(
         tmp_path, material=SOLID, time={"integrator": "static"}, solver=solver, force=[force],
         pin=[roller(0), roller(1), roller(2, 1.0)],
@@ -153,7 +140,7 @@ def test_plane_strain_has_the_stretches_of_its_closed_form(tmp_path: Path, solve
 def test_an_anchor_of_a_component_leaves_the_others_free(tmp_path: Path):
     """A block drawn out along z between smooth grips: uniaxial stress."""
     lift = {
-        "region": side(2, 0.25 - EPS, 1),
+        "region": half_space(2, 0.25 - EPS, 1),
         "fix": ["z"],
         "path": [{"time": 1, "by": [5, 5, 0.1]}],
     }

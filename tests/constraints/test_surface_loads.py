@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from block_scene import SIDES, block_scene, play
+from block_scene import EPS, SIDES, block_scene, half_space, play, roller
 from conftest import result_on
 from mpi4py import MPI
 from one_process import command_error
@@ -15,22 +15,12 @@ from msmpetsc.elasticity.pressure import Pressures
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.simulate import TimeLoop
 
-EPS = 1e-3
 YOUNG, NU = 1e5, 0.3
 SOLID = {"young_modulus": YOUNG, "density": 1000.0, "law": "neo-hookean", "poisson_ratio": NU}
 STATIC = {"integrator": "static"}
 ALL = {"box": [[0, 0, 0], [1, 1, 1]], "relative": True}
-END = {"half_space": {"point": [1 - EPS, 0, 0], "normal": [1, 0, 0]}}
+END = half_space(0, 1 - EPS, 1)
 VOLUME = SIDES.prod()
-
-
-def roller(axis: int, at: float = EPS, normal: int = -1) -> dict:
-    point, along = np.zeros((2, 3))
-    point[axis], along[axis] = at, normal
-    region = {"half_space": {"point": point.tolist(), "normal": along.tolist()}}
-    return {"region": region, "fix": ["xyz"[axis]]}
-
-
 CORNER = [roller(0), roller(1), roller(2)]
 
 

@@ -21,6 +21,22 @@ GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response":
 ROUGH_GROUND = GROUND | {"friction": 0.5}
 # stiffness of an edge inside the block (lattice.material)
 STIFFEST = 4 / 7 * YOUNG * CELL
+# how far a region reaches into a block to hold the nodes on a face [m]
+EPS = 1e-3
+
+
+def half_space(axis: int, at: float = EPS, normal: int = -1) -> dict:
+    """The half space beyond ``at`` along an axis."""
+    point, along = np.zeros((2, 3))
+    point[axis], along[axis] = at, normal
+    return {"half_space": {"point": point.tolist(), "normal": along.tolist()}}
+
+
+def roller(axis: int, at: float = EPS, normal: int = -1) -> dict:
+    return {"region": half_space(axis, at, normal), "fix": ["xyz"[axis]]}
+
+
+CLAMP = {"region": half_space(0)}
 
 
 def block_scene(folder: Path, sides: np.ndarray = SIDES, name: str = "scene", **tables) -> Path:
@@ -46,8 +62,7 @@ def block_scene(folder: Path, sides: np.ndarray = SIDES, name: str = "scene", **
 
 def clamped_beam(folder: Path, **tables) -> Path:
     """A beam of 1 m and 32 cells, clamped at x = 0, that swings under its weight."""
-    clamp = [{"region": {"half_space": {"point": [0.01, 0, 0], "normal": [-1, 0, 0]}}}]
-    swings = {"pin": clamp, "gravity": GRAVITY}
+    swings = {"pin": [CLAMP], "gravity": GRAVITY}
     return block_scene(folder, np.array([1.0, 0.25, 0.25]), **swings | tables)
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import CELL, GRAVITY, block_scene, clamped_beam, play
+from block_scene import CELL, CLAMP, GRAVITY, block_scene, clamped_beam, play
 from failing_steps import Failing
 
 from msmpetsc.errors import StepFailed
@@ -16,7 +16,6 @@ from msmpetsc.solve.nonlinear.step import Stepper
 
 STEP, STEPS = 1 / 60, 6
 TIME = {"step": STEP, "duration": STEPS * STEP}
-CLAMPED = [{"region": {"half_space": {"point": [0.01, 0, 0], "normal": [-1, 0, 0]}}}]
 
 
 def beam(folder: Path, **tables) -> Path:
@@ -55,7 +54,7 @@ def test_a_led_and_dragged_body_gains_nothing(tmp_path: Path, integrator: str, s
         "friction": 0.8,
     }
     floor |= {"path": [{"time": 0.05, "by": [0, 0, 0.01]}, {"time": 0.1, "by": [0.4, 0, 0.01]}]}
-    lead = {"region": CLAMPED[0]["region"], "path": [{"time": 0.1, "by": [0.1, 0, 0]}]}
+    lead = {"region": CLAMP["region"], "path": [{"time": 0.1, "by": [0.1, 0, 0]}]}
     for more in ({"obstacle": [floor], "gravity": GRAVITY}, {"anchor": [lead]}):
         _, frames = play(block_scene(tmp_path, time=time, **more))
         assert of(frames, "elastic").max() > 1e-4

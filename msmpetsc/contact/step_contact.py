@@ -60,6 +60,12 @@ class StepContact:
         """Return the contact at q."""
         return StepContactAt(self, q, [state.pressed(q[: self.owned]) for state in self.states])
 
+    @property
+    def has_friction(self) -> bool:
+        """Whether friction acts in the step."""
+        of_nodes = any(state.friction is not None for state in self.states)
+        return of_nodes or (self.surface is not None and self.surface.has_friction)
+
     def friction_limits(self, q: Positions) -> Floats:
         """Return the sum of mu N [N] that this rank's friction uses, and its value at q, (2,)."""
         of_nodes = sum(
@@ -114,6 +120,14 @@ class StepContactAt:
     def of_obstacles(self) -> Iterator[tuple[ObstacleContact, Pressed]]:
         """The contact of each obstacle, with the nodes inside."""
         return zip(self.contact.states, self.pressed, strict=True)
+
+    @property
+    def presses_nodes(self) -> bool:
+        """Whether an obstacle presses or rubs a node of this rank."""
+        return any(
+            len(rows) or (state.friction is not None and len(state.friction.nodes))
+            for state, (rows, _, _) in self.of_obstacles
+        )
 
     def add_gradient(self, gradient: Rows) -> None:
         """Add the gradient [N] of the contact energy to ``gradient`` (owned or more, 3)."""

@@ -94,6 +94,15 @@ class Multigrid:
         self.pc = PETSc.PC().create(unknowns.comm)
         self.owned.callback(self.pc.destroy)
 
+    def follow(self, contact: Rows) -> None:
+        """Give the finest level the present contact of each node, (owned, 9) or (0, 9) [N/m].
+
+        D gains the blocks that H gains, so that Chebyshev's bound remains. Coarse levels keep the
+        contact of the last ``update``.
+        """
+        self.fine.take_contact(contact)
+        self.operator.assemble()
+
     def _create_levels(self, elasticity: Elasticity, t2: float) -> tuple[GalerkinSum, list[Level]]:
         """Return the sum of the first coarse matrix, and the coarse levels without values."""
         unknowns, comm = self.unknowns, self.unknowns.comm

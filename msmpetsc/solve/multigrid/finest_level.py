@@ -20,6 +20,7 @@ class ProjectedHessian:
     H belongs to the positions of the last ``update`` and is positive definite.
 
     products   : number of products so far
+    q          : positions (l, 3) [m] of H
     inverse    : (m, 9) D^-1 [1/kg], zero in fixed components
     moves      : (m, 3) bool, the components that are not fixed
     compliance : (owned,) [m/N] estimated compliance of a node at rest
@@ -32,6 +33,7 @@ class ProjectedHessian:
         self.v = np.zeros_like(lattice.nodes, dtype=np.float32)
         self.product = np.empty_like(self.v)
         self.elastic: Hessian | None = None
+        self.q = lattice.nodes
         self.products = 0
         self.contact = np.empty((0, 9), like=lattice.nodes)
         self.inverse = np.empty((unknowns.size, 9), np.float32, like=lattice.nodes)
@@ -51,15 +53,19 @@ class ProjectedHessian:
         joined  : contact of the surface that couples nodes
         """
         self.elastic = self.elasticity.hessian_at(q, projected=True, dtype=np.float32)
-        self.contact = contact
-        unknowns, blocks = self.unknowns, np.zeros((len(q), 9), like=q)
-        self.elasticity.add_bound(q, blocks)
-        nodes = FreeNodes(unknowns.free, self.moves, unknowns.ballast, contact, self.t2)
-        invert_blocks(unknowns.size, self.inverse, blocks, nodes)
-        self.joined = joined
+        self.q, self.joined = q, joined
+        self.take_contact(contact)
         self.smoother = (
             ContactSmoother(self.unknowns, joined, self.t2, self.inverse) if joined else None
         )
+
+    def take_contact(self, contact: Rows) -> None:
+        """Replace the diagonal blocks of contact, (owned, 9) or (0, 9) [N/m]."""
+        self.contact = contact
+        unknowns, blocks = self.unknowns, np.zeros((len(self.q), 9), like=self.q)
+        self.elasticity.add_bound(self.q, blocks)
+        nodes = FreeNodes(unknowns.free, self.moves, unknowns.ballast, contact, self.t2)
+        invert_blocks(unknowns.size, self.inverse, blocks, nodes)
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Write H x to y."""

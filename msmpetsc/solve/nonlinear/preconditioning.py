@@ -193,13 +193,27 @@ class LatticePreconditioner(StepPreconditioner):
         return self.multigrid.fine.products
 
     def prepare(self, q: Positions, contact: StepContactAt | None) -> bool:
-        """Build a hierarchy at positions q (l, 3) [m] if it is due; return whether it was."""
-        self.is_free, is_due = self._is_free(q, contact), self.is_stale
-        self.is_new = is_due
-        if is_due:
+        """Build a hierarchy at positions q (l, 3) [m] if it is due; return whether it changed.
+
+        A kept hierarchy follows the contact of single nodes: a node that has come into contact
+        costs several iterations.
+        """
+        self.is_free, self.is_new = self._is_free(q, contact), self.is_stale
+        if self.is_new:
             surface = contact.surface.hessian(q, True) if contact and contact.surface else None
             self._build(q.copy(), self._blocks(contact), surface)
-        return is_due
+        elif contact and not contact.surface:
+            return self._follow(self._blocks(contact))
+        return self.is_new
+
+    def _follow(self, contact: Rows) -> bool:
+        """Give the hierarchy the present contact (owned, 9) [N/m]; return whether it changed."""
+        changed = not np.array_equal(contact, self.multigrid.fine.contact)
+        changed = bool(self.unknowns.comm.allreduce(changed, MPI.LOR))
+        if changed:
+            with HIERARCHY:
+                self.multigrid.follow(contact)
+        return changed
 
     def most_iterations(self, rtol: float) -> int | None:
         """Return the most iterations of a solve to a relative tolerance with this hierarchy.
@@ -249,8 +263,7 @@ class LatticePreconditioner(StepPreconditioner):
         # The self-contact of a lone body moves its centre no more than springs do
         if surface and not alone and surface.presses(q):
             return False
-        pressed = any(len(nodes) for nodes, _ in contact.hessian())
-        return not self.unknowns.comm.allreduce(pressed, MPI.LOR)
+        return not self.unknowns.comm.allreduce(contact.presses_nodes, MPI.LOR)
 
     def _blocks(self, contact: StepContactAt | None) -> Rows:
         """Return the Hessian (owned, 9) of obstacles, with the secant of friction.

@@ -21,7 +21,6 @@ from msmpetsc.results.checkpoint_reader import (
     refuse_changed_lattice,
     refuse_unlike_frame,
 )
-from msmpetsc.results.untrusted_file import refuse_deadly
 from msmpetsc.results.writer import Begin, ResultFile
 from msmpetsc.scene.problems import as_given
 from msmpetsc.scene.reading import Scene, load_scene, scene_of
@@ -64,7 +63,6 @@ def earlier_run(
     if may_start and not comm.bcast(on_root(comm, path.exists)):
         refuse_other_format("--resume", path, RESULT_NAMES)
         return None
-    on_root(comm, lambda: refuse_deadly(path))
     earlier: Earlier = comm.bcast(on_root(comm, lambda: Earlier.read(path)))
     return earlier
 

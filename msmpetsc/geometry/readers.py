@@ -1,6 +1,5 @@
 """Read surface meshes from files, which may be damaged or hostile."""
 
-import resource
 import struct
 import warnings
 from collections import defaultdict
@@ -13,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 import trimesh
 from trimesh.resolvers import FilePathResolver
 
@@ -30,11 +28,6 @@ Arrays = tuple[Array, Any, Mapping[str, Any]]
 # properties of a PLY's faces that are colours, not labels
 COLOURS = ("red", "green", "blue", "alpha")
 
-# memory that reading any file may take [byte]; the libraries' own memory is less
-LEAST_MEMORY = 2**28
-# memory that reading a file may take, in sizes of the file [-]; intact files need less
-MEMORY_FACTOR = 50
-
 
 def read_surface(path: str | Path) -> Surface:
     """Read PLY, OBJ, STL, OFF, GLB, glTF, mz3, VTU, VTK, MSH, INP or BDF in the file's own unit.
@@ -48,17 +41,13 @@ def read_surface(path: str | Path) -> Surface:
     kind = _kind(path)
     data = _content(path)
     try:
-        with _silence(), _bounded_memory(max(LEAST_MEMORY, MEMORY_FACTOR * len(data))):
+        with _silence():
             points, polygons, named = _READERS[kind](path, data)
             faces = _cut(polygons)
             groups = {name: _cut(own) for name, own in named.items()}
     # the message of a missing package names the extra that brings it
     except ModuleNotFoundError:
         raise
-    except MemoryError:
-        raise InputError(
-            f"{path}: reading it takes more memory than {kind.upper()} of its size can need"
-        ) from None
     # on damaged files the readers raise any exception
     except Exception as error:
         reason = one_line(error, 120)
@@ -120,22 +109,6 @@ def _silence() -> Iterator[None]:
         warnings.simplefilter("ignore")
         warnings.filterwarnings("error", message="string or file could not be read")
         yield
-
-
-@contextmanager
-def _bounded_memory(most: int) -> Iterator[None]:
-    """Raise MemoryError if the process takes ``most`` [byte] more within the block.
-
-    A hostile file may claim, or pack, more than it holds.
-    """
-    limits = resource.getrlimit(resource.RLIMIT_DATA)
-    bounds = [limit for limit in limits if limit != resource.RLIM_INFINITY]
-    bounds.append(psutil.Process().memory_info().data + most)
-    resource.setrlimit(resource.RLIMIT_DATA, (min(bounds), limits[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_DATA, limits)
 
 
 def _read_ply(path: Path, data: bytes) -> Arrays:

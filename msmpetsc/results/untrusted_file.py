@@ -1,13 +1,10 @@
-"""Open a result file without trusting it: a file may claim anything, or crash the HDF5 library.
+"""Open a result file without trusting it: a file may claim anything.
 
 The claims are checked when a file is opened, before any array is read. A hostile or damaged file
 raises an InputError of a single line.
 """
 
 import math
-import os
-import resource
-import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -22,9 +19,6 @@ from msmpetsc.results.disk import refuse_no_file
 
 FORMAT, FORMAT_VERSION = "msmpetsc", 1
 NEEDED = ("lattice/nodes", "frames/time", "frames/position")
-# time limit for reading a file's metadata [s]; an intact file takes far less
-TIME_LIMIT = 10
-CRASHES = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE)
 # largest compression ratio of zlib [-]
 DEFLATE_MOST = 1032
 
@@ -54,39 +48,6 @@ def open_result(path: str | Path) -> h5py.File:
         file.close()
         raise
     return file
-
-
-def refuse_deadly(path: Path) -> None:
-    """Raise InputError if the HDF5 library crashes or hangs on a file.
-
-    A child process reads the file first. Only commands may call this: threads forbid a fork.
-    """
-    child = os.fork()
-    if child == 0:
-        try:
-            for number in (*CRASHES, signal.SIGALRM):
-                signal.signal(number, signal.SIG_DFL)
-            resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-            signal.alarm(TIME_LIMIT)
-            _read_tables(path)
-        except BaseException:
-            pass
-        finally:
-            os._exit(0)
-    status = os.waitpid(child, 0)[1]
-    if os.WIFSIGNALED(status):
-        does = "hangs" if os.WTERMSIG(status) == signal.SIGALRM else "crashes"
-        raise InputError(f"{path} is damaged: the HDF5 library {does} on it")
-
-
-def _read_tables(path: Path) -> None:
-    """Read the attributes, and the metadata and a row of every dataset."""
-    with open_result(path) as file:
-        _ = dict(file.attrs)
-        count = finished(file)
-        for name, dataset in checked_datasets(file).items():
-            rows = slice(count if name.startswith("frames/") else None)
-            _ = dataset[rows, :1] if dataset.ndim == 3 else dataset[:1]
 
 
 def finished(file: h5py.File) -> int:

@@ -5,13 +5,10 @@ Each gives a mesh of finite points or an error of a line.
 
 import base64
 import json
-import lzma
 import os
-import re
 import struct
 import sys
 import tempfile
-import zlib
 from pathlib import Path
 
 import meshio
@@ -19,7 +16,6 @@ import numpy as np
 import pytest
 import trimesh
 from bad_input import TRIALS, damage, damaged, refusal
-from conftest import python
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mpi4py import MPI
@@ -347,14 +343,14 @@ def test_a_gltf_names_files_of_its_folder_only(tmp_path, opened, name):
     assert not [one for one in opened if one.endswith((".bin", "passwd"))]
 
 
-def glb(instances: int, faces: int, parts: int = 1) -> bytes:
+def glb(instances: int, faces: int) -> bytes:
     """Return a GLB file with a mesh that several nodes use."""
     points, corners = np.eye(3, dtype="<f4"), np.tile(np.arange(3, dtype="<u4"), faces)
     binary = points.tobytes() + corners.tobytes()
     part = {"attributes": {"POSITION": 0}, "indices": 1}
     tree = {
         "asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": list(range(instances))}],
-        "nodes": [{"mesh": 0}] * instances, "meshes": [{"primitives": [part] * parts}],
+        "nodes": [{"mesh": 0}] * instances, "meshes": [{"primitives": [part]}],
         "buffers": [{"byteLength": len(binary)}],
         "bufferViews": [
             {"buffer": 0, "byteLength": points.nbytes},
@@ -376,89 +372,6 @@ def glb(instances: int, faces: int, parts: int = 1) -> bytes:
         + struct.pack("<II", len(binary), 0x4E4942)
         + binary
     )
-
-
-def vtu(points: int, blocks: int = 1, compressor: str = "ZLib") -> bytes:
-    """Zeros, packed a thousandfold."""
-    pack = {"ZLib": zlib.compress, "LZMA": lzma.compress}[compressor]
-    block = pack(bytes(12 * points), **({} if compressor == "LZMA" else {"level": 9}))
-    header = np.array([blocks, 12 * points, 12 * points, *[len(block)] * blocks], "<u4").tobytes()
-    numbers = base64.b64encode(header) + base64.b64encode(block * blocks)
-    return (
-        b'<VTKFile type="UnstructuredGrid" version="0.1" byte_order="LittleEndian" '
-        b'compressor="vtk%sDataCompressor">'
-        b'<UnstructuredGrid><Piece NumberOfPoints="%d" NumberOfCells="0"><Points>'
-        b'<DataArray type="Float32" Name="Points" '
-        b'NumberOfComponents="3" '
-        b'format="binary">%s</DataArray></Points></Piece></UnstructuredGrid></VTKFile>'
-        % (compressor.encode(), points * blocks, numbers)
-    )
-
-
-def vtk(kind: str) -> bytes:
-    header = f"# vtk DataFile Version 3.0\nx\nASCII\nDATASET {kind}\nDIMENSIONS 330 330 330\n"
-    return (header + "ORIGIN 0 0 0\nSPACING 1 1 1\nPOINT_DATA 1\n").encode()
-
-
-def shared_vtu(arrays: int) -> bytes:
-    """Arrays that are all the same appended bytes."""
-    numbers = base64.b64encode(np.uint32(3 * 10**5).tobytes() + bytes(3 * 10**5))
-    array = b'<DataArray type="Float32" Name="x" format="appended" offset="0"/>'
-    return (
-        b'<VTKFile type="UnstructuredGrid" version="0.1" '
-        b'byte_order="LittleEndian"><UnstructuredGrid>'
-        b'<Piece NumberOfPoints="0" '
-        b'NumberOfCells="0"><PointData>%s</PointData></Piece></UnstructuredGrid>'
-        b'<AppendedData encoding="base64">_%s</AppendedData></VTKFile>' % (array * arrays, numbers)
-    )
-
-
-VTK = b"# vtk DataFile Version 3.0\nx\n"
-HOLLOW = re.sub(rb'"bufferView": 0, (.*?)"count": 8', rb'\1"count": 1000000000', gltf())
-CLAIMS = {
-    "a grid of 36 million points": ("vtk", vtk("STRUCTURED_POINTS"), "more memory"),
-    "10^9 points of VTK": (
-        "vtk",
-        VTK + b"BINARY\nDATASET UNSTRUCTURED_GRID\nPOINTS 1000000000 double\n",
-        "more memory",
-    ),
-    "10^9 zeros of glTF": ("gltf", HOLLOW, "more memory"),
-    "packed a thousandfold": ("vtu", vtu(10**7), "more memory"),
-    "in many blocks": ("vtu", vtu(10**5, blocks=1000), "more memory"),
-    "packed by lzma": ("vtu", vtu(10**7, compressor="LZMA"), "more memory"),
-    "shared bytes": ("vtu", shared_vtu(3000), "ReadError"),
-    "2,000 instances": ("glb", glb(2000, 50_000), "more memory"),
-    "a part again and again": ("glb", glb(1, 50_000, 2000), "more memory"),
-}
-
-
-# Reads a file, and prints its refusal, the memory [kB] that reading took, and whether
-# the limit of memory is gone
-READ = """
-import sys
-from pathlib import Path
-from resource import RLIM_INFINITY, RLIMIT_DATA, RUSAGE_SELF, getrlimit, getrusage
-from msmpetsc.errors import InputError
-from msmpetsc.geometry.readers import read_surface
-before = getrusage(RUSAGE_SELF).ru_maxrss
-try:
-    read_surface(Path(sys.argv[1]))
-except InputError as error:
-    print(error)
-print(getrusage(RUSAGE_SELF).ru_maxrss - before, getrlimit(RLIMIT_DATA)[0] == RLIM_INFINITY)
-"""
-
-
-@pytest.mark.parametrize("name", CLAIMS)
-def test_memory_that_a_file_claims_is_refused_before_it_is_made(tmp_path, name):
-    """In a process of its own, for a process that has freed memory takes it again unseen."""
-    kind, content, words = CLAIMS[name]
-    path = tmp_path / f"x.{kind}"
-    path.write_bytes(content)
-    *refusal_lines, measured = python("-c", READ, path).stdout.splitlines()
-    taken, is_unlimited = measured.split()
-    assert words in "\n".join(refusal_lines) and len(content) < 3e6
-    assert int(taken) < 3e5 and is_unlimited == "True"
 
 
 def test_what_is_instanced_as_people_do_it_is_read(tmp_path):

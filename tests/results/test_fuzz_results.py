@@ -15,9 +15,7 @@ from hypothesis import strategies as st
 
 import msmpetsc
 from msmpetsc.cli.commands import compare
-from msmpetsc.errors import InputError
 from msmpetsc.results.checkpoint_reader import Earlier
-from msmpetsc.results.untrusted_file import refuse_deadly
 
 SECRET = 7.25
 
@@ -177,17 +175,3 @@ def test_names_and_versions_act_on_no_terminal(bar_result, tmp_path):
     with h5py.File(path, "r+") as file:
         file.attrs["format_version"] = "\x1b[31m" + "x" * 5000
     assert "format_version ?[31mx" in refusal(lambda: msmpetsc.open(path))
-
-
-@pytest.mark.parametrize("ending", ["crashes", "hangs"])
-def test_where_hdf5_itself_fails_a_child_fails(bar_result, monkeypatch, ending):
-    """The child is made to crash as HDF5 does on damaged tables, where no exception comes."""
-    from msmpetsc.results import untrusted_file
-
-    code = {"crashes": "os.abort()", "hangs": "while True: pass"}[ending]
-    monkeypatch.setattr(untrusted_file, "TIME_LIMIT", 1)
-    monkeypatch.setattr(
-        untrusted_file, "_read_tables", lambda path: exec(code, {"os": __import__("os")})
-    )
-    with pytest.raises(InputError, match=f"bar.h5 is damaged: the HDF5 library {ending} on it"):
-        refuse_deadly(bar_result)

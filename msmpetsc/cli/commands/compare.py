@@ -18,7 +18,6 @@ from msmpetsc.results.comparison import (
     rest_of,
 )
 from msmpetsc.results.reader import Result
-from msmpetsc.results.untrusted_file import refuse_deadly
 
 HEAD = (
     f"{'field':16} {'greatest error':>14} {'at frame':>8} {'first above':>11} {'relative to':>11}"
@@ -29,8 +28,6 @@ def run(args: argparse.Namespace) -> int:
     """Compare two results; return the exit status."""
     if not 0 <= args.rtol < np.inf:
         raise InputError(f"--rtol must be a number from 0 on, not {args.rtol:g}")
-    refuse_deadly(args.first)
-    refuse_deadly(args.second)
     with Result(args.first) as first, Result(args.second) as second:
         comparison, notes = compared(first, second)
         fields = {field.name: record(field, comparison, args.rtol) for field in comparison.fields}

@@ -19,7 +19,7 @@ from msmpetsc.app.checks import (
 from msmpetsc.errors import InputError
 from msmpetsc.results.frame_choice import Frames, frames_of
 from msmpetsc.results.reader import Result
-from msmpetsc.results.untrusted_file import plain_damage, refuse_deadly
+from msmpetsc.results.untrusted_file import plain_damage
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.view.composition import Style, composition_of
 from msmpetsc.view.drawable import Drawable, drawable_of_model, drawable_of_result
@@ -53,7 +53,6 @@ def run(args: argparse.Namespace) -> int:
             )
     style = style_of(args)
     if args.subject.suffix.lower() in RESULT_NAMES:
-        refuse_deadly(args.subject)
         _draw_result(args, path, style)
     else:
         _draw_unrun(args, path, style)

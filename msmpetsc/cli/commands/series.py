@@ -10,7 +10,7 @@ from msmpetsc.backend.arrays import Floats
 from msmpetsc.errors import InputError
 from msmpetsc.results.disk import write_whole
 from msmpetsc.results.reader import Result
-from msmpetsc.results.untrusted_file import plain_damage, refuse_deadly
+from msmpetsc.results.untrusted_file import plain_damage
 from msmpetsc.scene.schema import SceneFile, holders_of, surface_loads
 from msmpetsc.view.drawable import read_scene
 
@@ -22,7 +22,6 @@ SERIES = (
 
 def run(args: argparse.Namespace) -> int:
     """Write the series of a result; return the exit status."""
-    refuse_deadly(args.result)
     if args.output and args.output.exists() and not args.overwrite:
         raise InputError(f"{args.output} exists already: --overwrite replaces it")
     with plain_damage(args.result), Result(args.result) as result:

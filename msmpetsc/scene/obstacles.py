@@ -132,7 +132,7 @@ class SelfContactTable(Table):
         None,
         description="distance at which surface parts start to repel each other [m]; if absent the "
         "greatest of 3e-4 of the rest bounding box's diagonal, the median distance of a coarser "
-        "surface from the body's own, and the lesser of 1/64 of a cell and the least gap at rest",
+        "surface from the body's own, and the lesser of 1/24 of a cell and the least gap at rest",
     )
     friction: NotNegative = Field(0.0, description="Coulomb friction coefficient [-]")
     friction_speed: Positive | None = Field(None, description=FRICTION_SPEED)

@@ -98,13 +98,13 @@ def test_a_small_pile_takes_few_iterations_a_step_without_a_distance_given(tmp_p
     )
     model, frames = play(scene)
     hard = [frame.iterations for frame in frames if frame.self_contacts > 20]
-    # 13 in a usual run
-    assert len(hard) >= 6 and np.median(hard) <= 25
+    # 10 in a usual run
+    assert len(hard) >= 6 and np.median(hard) <= 20
     assert crossings(model, frames) == 0
 
 
 def test_bodies_side_by_side_are_not_thrown_apart_without_a_distance_given(tmp_path):
-    """Their gap of 0.4 mm is less than 1/64 of a cell, which would push them from the start."""
+    """Their gap of 0.4 mm is less than 1/24 of a cell, which would push them from the start."""
     gap, mesh = 0.4e-3, box(tmp_path, "block", [SIDE] * 3)
     scene = write(
         tmp_path,

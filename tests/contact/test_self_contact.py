@@ -255,7 +255,7 @@ def test_a_coarser_surface_lies_on_the_body_says_how_far_it_is_off_and_pushes_fr
     assert f"up to {off.max():.2g} m, half of it by more than {np.median(off):.2g} m" in caplog.text
     diagonal = np.linalg.norm(np.ptp(whole, axis=0))
     cell = model.lattice.cell_size
-    assert model.collision.law.distance == pytest.approx(max(np.median(off), cell / 64))
+    assert model.collision.law.distance == pytest.approx(max(np.median(off), cell / 24))
     assert np.median(off) > 3e-4 * diagonal
     caplog.clear()
     far = {"surface": 400, "distance": 1.01 * off.max()}

@@ -28,9 +28,9 @@ from msmpetsc.scene.reading import Scene
 
 # Least default distance, as a share of the bounding box's diagonal
 NEAR = 3e-4
-# Default distance, as a share of a cell. A thinner barrier gives way before a cell
-# does, and cuts Newton's directions to a few hundredths (scripts/results/impact.md)
-SHARE = 1 / 64
+# Default distance [cells]; a thinner barrier sees impacts late and takes more
+# iterations, a wider barrier makes presses stiffer (scripts/results/impact.md)
+SHARE = 1 / 24
 # Most triangles that may be left out, as a share of all; with more of them left out,
 # little would keep the rest apart
 MOST_CUT = 0.1

@@ -7,7 +7,8 @@
 until the error of x_k is below the goal (error_control). Under compression H may be indefinite. CG
 then stops with the descent direction found so far. If CG's first direction has a negative
 curvature, g rises along y for every s. Then the projected Hessian, without negative parts, takes
-over for some iterations.
+over for some iterations. It also does if the surface would cross something almost at once along a
+direction that CG left unfinished: such a direction closes gaps whose stiffness CG has not met yet.
 """
 
 from dataclasses import dataclass, replace
@@ -40,6 +41,9 @@ LEAST, MOST = 0.1, 0.5
 SHORTEST = 1e-6
 # Share of its slope that a direction must keep when it is bent at obstacles
 DOWNHILL = 0.1
+# Share before a crossing of a direction of an indefinite H [-], below which the
+# projected Hessian takes over
+STUCK = 0.01
 # Options of PETSc's own convergence test of a linear solve
 TESTS = (
     "ksp_convergence_test",
@@ -117,7 +121,7 @@ class Newton(StepMethod):
             if outcome.is_converged:
                 reason = REASON.CONVERGED_SNORM_RELATIVE
                 break
-            self._limit(now)
+            share = self._limit(now)
             lower = self._search(now, outcome.is_flat)
             if lower is None and projected:
                 reason = REASON.DIVERGED_LINE_SEARCH
@@ -125,7 +129,8 @@ class Newton(StepMethod):
             if lower is None:
                 projected = PROJECTED
                 continue
-            projected, its = max(projected - 1, 0), its + 1
+            is_stuck = share < STUCK and self.ksp.reason == KSP.DIVERGED_INDEFINITE_MAT
+            projected, its = max(projected - 1, PROJECTED * is_stuck), its + 1
             now, outcome = lower, self._judge(lower, outcome, projected)
         self.iterations += its
         self._given = now, outcome
@@ -243,16 +248,20 @@ class Newton(StepMethod):
         self.functional.vectors.give_back(x)
         return None
 
-    def _limit(self, now: Iterate) -> None:
-        """Bend y at obstacles, then shorten it, so that the surface crosses nothing to x - y."""
+    def _limit(self, now: Iterate) -> float:
+        """Bend y at obstacles, then shorten it, so that the surface crosses nothing to x - y.
+
+        Return the share of the bent y that is left.
+        """
         if now.contact is None:
-            return
+            return 1.0
         self.end.waxpy(-1.0, self.y, now.x)
         with LOCAL:
             end = self._stop_at_obstacles(now, now.contact, self.functional.positions(self.end))
             share = self.functional.collision_free_step(now.q, end)
         if share < 1.0:
             self.y.scale(share)
+        return share
 
     def _stop_at_obstacles(self, now: Iterate, contact: StepContactAt, end: Positions) -> Positions:
         """Bend y so that nodes stop at obstacles that they would enter.

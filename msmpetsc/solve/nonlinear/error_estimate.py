@@ -10,8 +10,8 @@ with r_k = F - H e_k, if no eigenvalue of M^(-1) H is below lambda and none of P
 The first bound is safe, but too high by up to a thousand on stiff bodies. The second is close, but
 too low if CG has not met the least eigenvalue, since kappa is its least Ritz value. It is at most
 1, the mean of the eigenvalues if P is the diagonal of H. The geometric mean of both stands for the
-missing part in Newton's own solves (CorrectionTest). Once contact has acted in a step, and in a
-solve for the estimate alone (ErrorEstimate), it is the first bound.
+missing part in Newton's own solves (CorrectionTest). With contact, and in a solve for the estimate
+alone (ErrorEstimate), it is the first bound.
 
 A solve for the estimate alone ends if
 
@@ -138,24 +138,24 @@ class CorrectionTest:
 
     def __init__(self, estimate: ErrorEstimate, ksp: PETSc.KSP):
         self.estimate, self.is_accepted = estimate, False
-        # Least eigenvalue of P^(-1) H that the step has met, at most 1; 0 after contact
+        # Least eigenvalue of P^(-1) H that the step has met, at most 1; 0 with contact
         self._least = 1.0
         self._acceptable = self._first = 0.0
         ksp.setComputeSingularValues(True)
         ksp.setConvergenceTest(self)
 
-    def begin_step(self) -> None:
-        """Forget the last step: its eigenvalues, and the error that it accepted."""
-        self._least, self._acceptable = 1.0, 0.0
+    def begin_step(self, has_contact: bool) -> None:
+        """Forget the last step: its eigenvalues, and the error that it accepted.
 
-    def begin(self, acceptable: float, has_contact: bool) -> None:
+        has_contact : whether H has contact, whose small eigenvalues CG meets late
+        """
+        self._least, self._acceptable = 0.0 if has_contact else 1.0, 0.0
+
+    def begin(self, acceptable: float) -> None:
         """Begin a solve.
 
-        acceptable  : error [m sqrt(kg)] of x; 0 if the solve does not tell the error
-        has_contact : whether contact acts, whose small eigenvalues CG meets late
+        acceptable : error [m sqrt(kg)] of x; 0 if the solve does not tell the error
         """
-        if has_contact:
-            self._least = 0.0
         self.estimate.lowest, self.is_accepted = self.estimate.convexity, False
         self._acceptable = acceptable
 

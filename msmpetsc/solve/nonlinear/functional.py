@@ -143,14 +143,6 @@ class StepFunctional:
         """Return the step's contact at positions q (l, 3) [m]; None without contact."""
         return self.problem.contact.at(q) if self.problem.contact else None
 
-    def touches(self, iterate: Iterate) -> bool:
-        """Return whether contact acts at an iterate."""
-        contact = iterate.contact
-        if contact is None:
-            return False
-        of_surface = contact.surface is not None and contact.surface.presses(iterate.q)
-        return of_surface or bool(self.comm.allreduce(contact.presses_nodes, MPI.LOR))
-
     def at(self, q: Positions) -> Iterate:
         """Return the iterate whose free nodes are at q (l, 3) [m]."""
         x = self.vectors.take()

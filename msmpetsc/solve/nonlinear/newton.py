@@ -84,7 +84,7 @@ class Newton(StepMethod):
         self.friction.begin(self.functional.problem.contact)
         self.slopes = None
         if self.test:
-            self.test.begin_step()
+            self.test.begin_step(self.functional.problem.contact is not None)
 
     def _create_test(self) -> CorrectionTest | None:
         """Return the test of CG that also tells the error of x; None for other linear solves."""
@@ -167,10 +167,10 @@ class Newton(StepMethod):
     def _tells_error(self, now: Iterate, outcome: Outcome, projected: int) -> bool:
         """Return whether the next linear solve tells the error.
 
-        With friction it does so near the goal only. Before, duals stand for its curvature.
+        With contact it does so near the goal only. Before, duals stand for the curvature of
+        friction.
         """
-        has_friction = now.contact is not None and now.contact.contact.has_friction
-        is_near = not has_friction or self.control.is_near(outcome)
+        is_near = now.contact is None or self.control.is_near(outcome)
         return is_near and self._can_tell_error(projected)
 
     def _linearise(self, now: Iterate, is_true: bool, projected: bool) -> None:
@@ -199,7 +199,7 @@ class Newton(StepMethod):
         self.ksp.setOperators(self.jacobian.operator)
         if self.test:
             acceptable = outcome.goal * outcome.distance if tells_error else 0.0
-            self.test.begin(acceptable, self.functional.touches(now))
+            self.test.begin(acceptable)
         self.ksp.solve(now.f, self.y)
         self.jacobian.preconditioner.learn(self.ksp.its, rtol)
         if self.ksp.reason == KSP.DIVERGED_INDEFINITE_MAT:
@@ -211,23 +211,22 @@ class Newton(StepMethod):
     def _trust(self, now: Iterate, outcome: Outcome) -> float:
         """Return a lower bound of the share of the error that y is; 0 if y says nothing of it.
 
-        Contact has kinks that no H predicts: if it acts at x or x - y, y counts as the error.
+        Contact has kinks that no H predicts: there y counts as the error.
 
         Newton's corrections shrink by about theta if H does not predict a part theta |F(x)| of
         F(x - y). The error is then at most |y|_M / (1 - theta) (Deuflhard 2011, Newton Methods for
         Nonlinear Problems, Sect. 2.1).
         """
-        functional, x = self.functional, self.end
-        if functional.touches(now):
+        if now.contact:
             return 1.0
-        f = functional.vectors.take()
+        functional, x, f = self.functional, self.end, self.functional.vectors.take()
         x.waxpy(-1.0, self.y, now.x)
         with LOCAL:
-            end = functional.evaluate(x, f)
+            functional.evaluate(x, f)
         f.axpy(-1.0, self.control.estimate.residual)
         theta = functional.dual_norm(f) / outcome.residual
         functional.vectors.give_back(f)
-        return 1.0 if functional.touches(end) else max(1 - theta, 0.0)
+        return max(1 - theta, 0.0)
 
     def _search(self, now: Iterate, flat: bool) -> Iterate | None:
         """Return the first iterate x - s y of sufficient descent; None if g falls for no s.

@@ -200,12 +200,22 @@ class Multigrid:
         return "\n".join(lines)
 
     def _finest_bound(self) -> float:
-        """Return a bound on the eigenvalues of D^-1 H of the finest level, or an estimate by CG."""
-        bound, unknowns = self.fine.elasticity.bound, self.unknowns
+        """Return a bound on the eigenvalues of D^-1 H of the finest level, or an estimate by CG.
+
+        The estimate leaves out blocks of contact. They are a part of D and of H and raise no
+        eigenvalue above the bound, but might hide a greater eigenvalue of nodes that later let go.
+        """
+        bound, unknowns, contact = self.fine.elasticity.bound, self.unknowns, self.fine.contact
         if bound is not None:
             return bound
         noise = uniform(unknowns.numbers[to_host(unknowns.free)]).T.ravel()
-        return SAFETY * largest_eigenvalue(self.operator, noise, DiagonalBlocks(self.fine))
+        follows = self.fine.joined is None
+        if follows:
+            self.fine.take_contact(contact[:0])
+        bound = SAFETY * largest_eigenvalue(self.operator, noise, DiagonalBlocks(self.fine))
+        if follows:
+            self.fine.take_contact(contact)
+        return bound
 
     def _galerkin_product(self, finer: Level, level: Level) -> None:
         """Compute P^T H P of a level from the matrix of the next finer coarse level."""

@@ -102,7 +102,12 @@ class Springs(NamedTuple):
 
 
 def crushing_energy(lattice: Lattice) -> float:
-    """Return the energy [J] that compresses every spring of this rank to zero length."""
+    """Return the energy [J] that compresses every spring of this rank to zero length.
+
+    If the law is a solid, it is the energy of L that compresses every cell to a point.
+    """
+    if lattice.solid:
+        return float(1.5 * lattice.solid.bounds[: lattice.cells_owned].sum())
     springs = slice(lattice.springs_owned)
     return float(0.5 * lattice.stiffness[springs] @ lattice.rest_length[springs] ** 2)
 

@@ -4,9 +4,10 @@ Each rank holds its owned nodes, every spring of an owned node, and the ghost no
 ends. Global node numbers follow Morton order, so they do not depend on the number of ranks.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import Any
+from functools import cached_property, partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -16,12 +17,42 @@ from msmpetsc.comm import starts
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.geometry.copies import Copies
 from msmpetsc.geometry.partition import SortedKeys
-from msmpetsc.lattice.mass_and_stiffness import SolidCells, law_of_solid, law_of_springs
+from msmpetsc.lattice.mass_and_stiffness import (
+    SolidCells,
+    law_of_solid,
+    law_of_springs,
+    stiffness_of_solid,
+)
 from msmpetsc.lattice.material import MaterialOfCells
-from msmpetsc.lattice.topology import DIRECTION_KIND, Topology, topology_of
+from msmpetsc.lattice.topology import DIRECTION_KIND, SpringNet, Topology, topology_of
 from msmpetsc.scene.body import Material
 
 NO_CELLS = np.empty((0, 8), np.int64)
+
+
+class MadeSprings(NamedTuple):
+    """Local ends (s, 2), rest length (s,) [m] and stiffness (s,) [N/m] of springs."""
+
+    ends: Indices
+    rest_length: Floats
+    stiffness: Floats
+
+    @classmethod
+    def of(cls, net: SpringNet, h: float, stiffness: float | Floats) -> "MadeSprings":
+        """Return the springs of a net on cells of size h [m]."""
+        rest_length = h * np.sqrt(DIRECTION_KIND[net.direction])
+        return cls(net.ends, rest_length, np.broadcast_to(stiffness, len(net.ends)).copy())
+
+
+NO_SPRINGS = MadeSprings(np.empty((0, 2), np.int32), np.empty(0), np.empty(0))
+
+
+def _springs_of_solid(
+    net: Topology, h: float, material: Material, of_cells: MaterialOfCells | None
+) -> MadeSprings:
+    """Return the springs of L of a solid (collective)."""
+    springs = net.springs()
+    return MadeSprings.of(springs, h, stiffness_of_solid(net, springs, h, material, of_cells))
 
 
 @dataclass(frozen=True)
@@ -36,8 +67,9 @@ class Lattice:
     cell_kind   : (c,) BOUNDARY or INTERIOR of geometry.cages
     springs     : (s, 2) local ends. This rank owns the first ``springs_owned``, whose first end has
                   the lower number. The rank of the lower-numbered end owns each further spring.
+                  A solid has none of them before ``with_springs``.
     rest_length : (s,) distance of the ends at rest [m]
-    stiffness   : (s,) [N/m]; a solid has zero-length springs whose L bounds its Hessian at rest
+    stiffness   : (s,) [N/m]
     fixed       : (l, 3) bool, components of nodes that do not move
     local_cells : (d, 8) local corner nodes of cells. The first ``cells_owned`` are the cells whose
                   first corner this rank owns. For a solid all cells around owned nodes follow.
@@ -49,6 +81,7 @@ class Lattice:
     volumetric  : name of a solid's volumetric energy (elasticity.neo_hookean)
     viscous     : beta / tau [-], viscosity of a step over the stiffness (elasticity.viscosity)
     pressed     : surfaces under pressure (lattice.embedded_surface.SurfacePart)
+    make_springs : makes the springs of a solid (collective); None if they are here
     """
 
     table: SortedKeys
@@ -73,6 +106,7 @@ class Lattice:
     volumetric: str = "quadratic"
     viscous: float = 0.0
     pressed: tuple[Any, ...] = ()
+    make_springs: Callable[[], MadeSprings] | None = None
 
     @property
     def owned(self) -> int:
@@ -115,6 +149,22 @@ class Lattice:
         """Nodes (h,) and components (h,) that are fixed, of nodes that are fixed in part."""
         return np.nonzero(self.fixed & ~self.pinned[:, None])
 
+    def with_springs(self) -> "Lattice":
+        """Return this lattice with its springs (collective).
+
+        A solid has zero-length springs, whose L bounds its Hessian at rest. They serve A alone.
+        """
+        if self.make_springs is None:
+            return self
+        springs = self.make_springs()
+        return replace(
+            self,
+            springs=springs.ends,
+            rest_length=springs.rest_length,
+            stiffness=(1 + self.viscous) * springs.stiffness,
+            make_springs=None,
+        )
+
     def pin(self, where: Mask) -> "Lattice":
         """Return this lattice with the nodes (l,) or components (l, 3) ``where`` fixed, too."""
         return replace(self, fixed=self.fixed | where.reshape(len(where), -1))
@@ -137,7 +187,14 @@ def build_lattice(
     first_owned = net.cells[:, 0] < len(net.octants)
     further = ~first_owned & is_solid
     kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(further)])
-    law = (law_of_solid if is_solid else law_of_springs)(net, h, material, of_cells)
+    springs, make_springs = NO_SPRINGS, None
+    if is_solid:
+        make_springs = partial(_springs_of_solid, net, h, material, of_cells)
+        law, springs_owned = law_of_solid(net, h, material, of_cells), net.count_springs()
+    else:
+        found = net.springs()
+        law, springs_owned = law_of_springs(net, found, h, material, of_cells), found.owned
+        springs = MadeSprings.of(found, h, law.springs)
     grids = cages.grids
     nodes_of_bodies = np.bincount(
         grids.body_of(net.ijk[: len(law.mass)]), minlength=len(grids.grids)
@@ -153,10 +210,10 @@ def build_lattice(
         cell_fill=np.ones(len(cages.kind))
         if cages.fills is None
         else cages.fills.mean(axis=(1, 2, 3)),
-        springs=net.springs,
-        springs_owned=net.springs_owned,
-        rest_length=h * np.sqrt(DIRECTION_KIND[net.direction]),
-        stiffness=np.broadcast_to(law.springs, len(net.springs)).copy(),
+        springs=springs.ends,
+        springs_owned=springs_owned,
+        rest_length=springs.rest_length,
+        stiffness=springs.stiffness,
         fixed=np.zeros((len(net.ijk), 3), bool),
         local_cells=net.cells[kept],
         cells_owned=int(first_owned.sum()),
@@ -165,4 +222,5 @@ def build_lattice(
         first_of_body=starts(net.table.comm.allreduce(nodes_of_bodies)),
         solid=law.solid and SolidCells(*(rows[kept] for rows in law.solid)),
         volumetric=material.volume,
+        make_springs=make_springs,
     )

@@ -18,7 +18,14 @@ from msmpetsc.lattice.material import (
     edge_stiffness,
     lame_constants,
 )
-from msmpetsc.lattice.topology import DIRECTION, DIRECTION_KIND, Topology, find_slot, slots
+from msmpetsc.lattice.topology import (
+    DIRECTION,
+    DIRECTION_KIND,
+    SpringNet,
+    Topology,
+    find_slot,
+    slots,
+)
 from msmpetsc.scene.body import Material
 
 
@@ -35,24 +42,36 @@ class SolidCells(NamedTuple):
     shear: Floats
     lame: Floats
 
+    @property
+    def bounds(self) -> Floats:
+        """Return (2 mu + 3 lambda) V (d,) [J].
+
+        Times the mean |grad u|^2 it bounds the second variation at rest.
+        """
+        return (2 * self.shear + 3 * self.lame) * self.volume
+
 
 class LawConstants(NamedTuple):
     """The material data of a rank's nodes, springs and cells. A scalar holds for all items.
 
     mass    : (owned,) [kg]
-    springs : (s,) stiffness [N/m]; for a solid, of the constant L
     cells   : (d,) stiffness of an edge inside a body of the cell's material [N/m]
+    springs : (s,) stiffness [N/m]; 0 if the law is a solid
     solid   : (d,) constants of a solid's cells; None if the law is springs
     """
 
     mass: Floats
-    springs: float | Floats
     cells: float | Floats
+    springs: float | Floats = 0.0
     solid: SolidCells | None = None
 
 
 def law_of_springs(
-    net: Topology, h: float, material: Material, of_cells: MaterialOfCells | None
+    net: Topology,
+    springs: SpringNet,
+    h: float,
+    material: Material,
+    of_cells: MaterialOfCells | None,
 ) -> LawConstants:
     """Return masses and spring stiffnesses; a spring has the mean over the cells that share it."""
     if of_cells is None and net.fills is None:
@@ -65,12 +84,13 @@ def law_of_springs(
         of_pairs = spring_fractions(fills)
         of_corners = made_of.density[:, None] * mass_fractions(of_pairs)
         mass = h**3 / 8 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
-        of_spring = _sums_of_springs(net, made_of.spring, of_pairs) / net.sharing
-        law = LawConstants(mass, of_spring, fills.mean(axis=1) * made_of.spring)
+        of_spring = _sums_of_springs(net, springs, made_of.spring, of_pairs) / springs.sharing
+        law = LawConstants(mass, fills.mean(axis=1) * made_of.spring, of_spring)
     if material.stiffness is not None:
         return law
-    springs = calibrated_stiffness(law.springs, h, DIRECTION_KIND[net.direction], net.sharing)
-    return LawConstants(law.mass, springs, edge_stiffness(law.cells, h))
+    kind = DIRECTION_KIND[springs.direction]
+    stiffness = calibrated_stiffness(law.springs, h, kind, springs.sharing)
+    return LawConstants(law.mass, edge_stiffness(law.cells, h), stiffness)
 
 
 def _made_of(
@@ -98,36 +118,59 @@ def _made_of(
 def law_of_solid(
     net: Topology, h: float, material: Material, of_cells: MaterialOfCells | None
 ) -> LawConstants:
-    """Return masses, spring stiffnesses of L and cell constants of a solid.
+    """Return masses and cell constants of a solid.
 
     A corner's lumped mass is proportional to the diagonal of L, as with springs.
     """
     owned, count = len(net.octants), len(net.cells)
     made_of, net = _made_of(net, material, of_cells)
     shear, lame = lame_constants(made_of.spring, made_of.poisson)
-    forms = np.broadcast_to(WHOLE, (count, len(WHOLE)))
-    volume = np.ones(count)
-    pairs = np.broadcast_to(laplacians(WHOLE[None], np.ones(1)), (count, 8, 8))
-    cut = np.empty(0, np.int64)
-    if net.fills is not None and net.moments is not None:
-        forms, pairs = forms.copy(), pairs.copy()
-        cut = np.flatnonzero(net.fills.min(axis=1) < 1)
-        volume[cut] = net.fills[cut].mean(axis=1)
-        forms[cut] = forms_of(net.fills[cut], net.moments[cut])
-        pairs[cut] = laplacians(forms[cut], volume[cut])
-    diagonal = np.diagonal(pairs, axis1=1, axis2=2).copy()
+    forms, volume, cut = _forms(net)
+    diagonal = np.broadcast_to(
+        laplacians(WHOLE[None], np.ones(1)).diagonal(axis1=1, axis2=2), (count, 8)
+    )
+    if len(cut):
+        diagonal = diagonal.copy()
+        diagonal[cut] = laplacians(forms[cut], volume[cut]).diagonal(axis1=1, axis2=2)
     of_corners = (made_of.density * volume / diagonal.sum(axis=1))[:, None] * diagonal
     mass = h**3 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
+    cells = SolidCells(forms, h**3 * volume, shear, lame)
+    return LawConstants(mass, edge_stiffness(volume * made_of.spring, h), solid=cells)
+
+
+def stiffness_of_solid(
+    net: Topology,
+    springs: SpringNet,
+    h: float,
+    material: Material,
+    of_cells: MaterialOfCells | None,
+) -> Floats:
+    """Return the stiffness (s,) [N/m] of the springs of L of a solid (collective)."""
+    made_of, net = _made_of(net, material, of_cells)
+    shear, lame = lame_constants(made_of.spring, made_of.poisson)
+    pairs = np.broadcast_to(laplacians(WHOLE[None], np.ones(1)), (len(net.cells), 8, 8))
+    forms, volume, cut = _forms(net)
     if len(cut):
+        pairs = pairs.copy()
         pairs[cut] = bounding_laplacians(forms[cut], volume[cut])
     # 2 mu + 3 lambda times |grad u|^2 bounds the second variation at rest.
-    modulus = 2 * shear + 3 * lame
-    of_spring = _sums_of_springs(net, -h * modulus, pairs)
-    cells = SolidCells(forms, h**3 * volume, shear, lame)
-    return LawConstants(mass, of_spring, edge_stiffness(volume * made_of.spring, h), cells)
+    return _sums_of_springs(net, springs, -h * (2 * shear + 3 * lame), pairs)
 
 
-def _sums_of_springs(net: Topology, values: Floats, weights: Rows) -> Floats:
+def _forms(net: Topology) -> tuple[Rows, Floats, Indices]:
+    """Return the strain forms (d, 13) and volumes (d,) [cells] of cells, and which are cut."""
+    count = len(net.cells)
+    forms, volume = np.broadcast_to(WHOLE, (count, len(WHOLE))), np.ones(count)
+    if net.fills is None or net.moments is None:
+        return forms, volume, np.empty(0, np.int64)
+    cut = np.flatnonzero(net.fills.min(axis=1) < 1)
+    forms = forms.copy()
+    volume[cut] = net.fills[cut].mean(axis=1)
+    forms[cut] = forms_of(net.fills[cut], net.moments[cut])
+    return forms, volume, cut
+
+
+def _sums_of_springs(net: Topology, springs: SpringNet, values: Floats, weights: Rows) -> Floats:
     """Return the weighted sum (s,) of cell ``values`` (d,) over the cells that share each spring.
 
     The order of summation does not depend on the rank.
@@ -135,7 +178,7 @@ def _sums_of_springs(net: Topology, values: Floats, weights: Rows) -> Floats:
     weights : (d, 8, 8) weight of a cell's value for the spring between two of its corners
     """
     sums = _sums_by_slot(net.cells, values, weights, len(net.octants), net.further)
-    return sums.ravel()[net.slot]
+    return sums.ravel()[springs.slot]
 
 
 @njit()

@@ -71,11 +71,12 @@ def count_partition(lattice: Topology, ranks: int) -> Partition:
     nodes = len(lattice.octants)
     rank_of_cell = np.arange(cells) * ranks // cells
     rank_of_node = np.arange(nodes) * ranks // nodes
-    rank_of_end = rank_of_node[lattice.springs]
+    springs = lattice.springs().ends
+    rank_of_end = rank_of_node[springs]
     is_cut = rank_of_end[:, 0] != rank_of_end[:, 1]
     # the far end of each cut spring is a ghost of the rank at its near end
     near_rank = rank_of_end[is_cut].ravel()
-    far_node = lattice.springs[is_cut][:, ::-1].ravel()
+    far_node = springs[is_cut][:, ::-1].ravel()
     ghosts = np.unique(near_rank * nodes + far_node)
     ghost_rank = ghosts // nodes
     owner = rank_of_node[ghosts % nodes]

@@ -17,8 +17,28 @@ DIRECTION = (CORNERS[None, :, :] - CORNERS[:, None, :] + 1) @ np.array([9, 3, 1]
 DIRECTION_KIND = ((np.stack(np.unravel_index(np.arange(27), (3, 3, 3))) - 1) ** 2).sum(axis=0)
 
 
+class SpringNet(NamedTuple):
+    """Springs of a rank, without material; owned springs come first.
+
+    ends    : (s, 2) local ends
+    owned   : number of springs that the rank owns
+    slot    : (s,) place of each spring in the sums of its first end (``find_slot``)
+    sharing : (s,) number of cells that share each spring
+    """
+
+    ends: Indices
+    owned: int
+    slot: Indices
+    sharing: Indices
+
+    @property
+    def direction(self) -> Indices:
+        """Direction (s,) of each spring from its first end, as in DIRECTION."""
+        return self.slot % 27
+
+
 class Topology(NamedTuple):
-    """Nodes, cells and springs of a rank, without material. Further fields are those of Lattice.
+    """Nodes and cells of a rank, without material. Further fields are those of Lattice.
 
     corners : (c, 8) global corner nodes of the cells that this rank owns
     ijk     : (l, 3) grid index of the nodes, ghosts included
@@ -27,8 +47,6 @@ class Topology(NamedTuple):
     cells   : (d, 8) their local corner nodes
     fills   : (d, 8) fills of their corners (geometry.fill_fractions); None if all cells are whole
     moments : (d, 3) second moments (geometry.fill_fractions); None if all cells are whole
-    slot    : (s,) place of each spring in the sums of its first end (``find_slot``)
-    sharing : (s,) number of cells that share each spring
     further : number of further rows of sums, of nodes with several neighbours in a direction
     """
 
@@ -41,16 +59,20 @@ class Topology(NamedTuple):
     cells: Indices
     fills: Rows | None
     moments: Rows | None
-    springs: Indices
-    springs_owned: int
-    slot: Indices
-    sharing: Indices
     further: int
 
     @property
-    def direction(self) -> Indices:
-        """Direction (s,) of each spring from its first end, as in DIRECTION."""
-        return self.slot % 27
+    def _numbers(self) -> Indices:
+        """Global number (l,) of each local node."""
+        return np.concatenate([self.table.first + np.arange(len(self.octants)), self.ghosts])
+
+    def count_springs(self) -> int:
+        """Return the number of springs that this rank owns."""
+        return int(_neighbours(self.cells, self._numbers, len(self.octants), self.further)[-1])
+
+    def springs(self) -> SpringNet:
+        """Return the springs between the corners of cells."""
+        return SpringNet(*_springs(self.cells, self._numbers, len(self.octants), self.further))
 
 
 def topology_of(cages: Cages) -> Topology:
@@ -68,13 +90,9 @@ def topology_of(cages: Cages) -> Topology:
     fills = cages.of_cells(keys, cages.fills)
     fills = None if fills is None else fills[:, *CORNERS.T]
     moments = cages.of_cells(keys, cages.moments)
-    numbers = np.concatenate([table.first + np.arange(owned), ghosts])
-    further = (COPIES - 1) * several
-    springs = _springs(cells, numbers, owned, further)
     ijk = decode_morton(node_keys)
-    return Topology(
-        table, corners, ijk, octants, ghosts, keys, cells, fills, moments, *springs, further
-    )
+    further = (COPIES - 1) * several
+    return Topology(table, corners, ijk, octants, ghosts, keys, cells, fills, moments, further)
 
 
 def _cells_around(cages: Cages, table: SortedKeys) -> tuple[Indices, Mask, int]:
@@ -129,17 +147,17 @@ def slots(owned: int, further: int) -> tuple[Indices, Indices]:
 
 
 @njit()
-def _springs(
+def _neighbours(
     cells: Indices, numbers: Indices, owned: int, further: int
-) -> tuple[Indices, int, Indices, Indices]:
-    """Return the springs between the corners of cells.
+) -> tuple[Indices, Indices, Indices, int, int]:
+    """Return the neighbours of nodes in cells.
 
     cells   : (d, 8) local corner nodes; nodes below ``owned`` are owned
     numbers : (l,) global node numbers
     further : number of further rows for nodes with several neighbours in a direction
 
-    Returns the local ends (s, 2), the number of owned springs, the slots (s,), and the number (s,)
-    of cells that share each spring. Owned springs come first.
+    Returns the tables of ``find_slot``, the number of cells that share each neighbour, the number
+    of springs of the rank, and the number of springs that it owns.
     """
     neighbour, following = slots(owned, further)
     sharing = np.zeros((owned + further, 27), np.uint8)
@@ -154,13 +172,24 @@ def _springs(
     for row in range(owned + further):
         if following[row] >= 0:
             first[following[row]] = first[row]
-    count = 0
+    count, own = 0, 0
     for row in range(owned + further):
         for end in neighbour[row]:
-            count += end >= 0 and (numbers[end] > numbers[first[row]] or end >= owned)
+            is_own = end >= 0 and numbers[end] > numbers[first[row]]
+            own += is_own
+            count += is_own or end >= owned
+    return neighbour, following, sharing, count, own
+
+
+@njit()
+def _springs(
+    cells: Indices, numbers: Indices, owned: int, further: int
+) -> tuple[Indices, int, Indices, Indices]:
+    """Return the fields of SpringNet; the arguments are those of ``_neighbours``."""
+    neighbour, following, sharing, count, _ = _neighbours(cells, numbers, owned, further)
     springs = np.empty((count, 2), np.int32)
     slot = np.empty(count, np.int64)
-    shared = np.empty(count, np.int64)
+    shared = np.empty(count, np.uint8)
     ends, places = np.empty(27 * COPIES, np.int64), np.empty(27 * COPIES, np.int64)
     # Owned springs fill the arrays from the front, all further springs from the back.
     low, high = 0, count

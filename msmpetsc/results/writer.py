@@ -412,7 +412,7 @@ class ResultFile:
 
 def write_model(comm: MPI.Intracomm, file: ResultFile, model: Model) -> None:
     """Write the parts of the file that do not change with time (collective)."""
-    lattice, owned = model.lattice, model.lattice.owned
+    lattice, owned = model.lattice.with_springs(), model.lattice.owned
     springs = slice(lattice.springs_owned)
     numbers = lattice.global_numbers
     file.write("lattice/nodes", lattice.nodes[:owned])

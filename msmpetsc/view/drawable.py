@@ -197,7 +197,7 @@ def drawable_of_model(path: Path, scene: "Scene", model: "Model") -> Drawable:
 
     Raises InputError if the model has no surface.
     """
-    lattice = model.lattice
+    lattice = model.lattice.with_springs()
     surface = model.surface
     embedding = model.embedding
     owned = lattice.owned

@@ -85,7 +85,8 @@ def cages_of(mesh: trimesh.Trimesh, h: float = H) -> tuple[Cages, Topology]:
 
 def components(net: Topology) -> int:
     """Number of connected parts of a lattice."""
-    ends = coo_array((np.ones(len(net.springs)), net.springs.T), shape=(len(net.ijk),) * 2)
+    springs = net.springs().ends
+    ends = coo_array((np.ones(len(springs)), springs.T), shape=(len(net.ijk),) * 2)
     return connected_components(ends, directed=False)[0]
 
 

@@ -272,8 +272,7 @@ class ImplicitEuler(Integrator):
         solver = self.solver
         lattice = self.environment.lattice.pin(self.environment.anchors.fixed_at(time))
         if self.retardation:
-            factor = self.retardation / self.tau
-            lattice = replace(lattice, stiffness=(1 + factor) * lattice.stiffness, viscous=factor)
+            lattice = replace(lattice, viscous=self.retardation / self.tau)
         return Stepper(
             self.comm,
             lattice,

@@ -26,6 +26,7 @@ from msmpetsc.comm import log
 from msmpetsc.elasticity.locate import of_body, worst_inverted
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.integrators.implicit import ContactFaces, ImplicitEuler
 from msmpetsc.solve.integrators.integrator import State
 from msmpetsc.solve.linear.unknowns import Unknowns
@@ -159,9 +160,7 @@ class Static(ImplicitEuler):
         """Return SLENDER times the time [s] of sound along the longest side (collective)."""
         lattice = self.environment.lattice
         cells = lattice.longest_side() / lattice.cell_size
-        sums = np.array(
-            [float(lattice.mass.sum()), float(lattice.stiffness[: lattice.springs_owned].sum())]
-        )
+        sums = np.array([float(lattice.mass.sum()), _stiffness(lattice)])
         mass, stiffness = self.comm.allreduce(sums)
         return SLENDER * float(cells * np.sqrt(mass / max(stiffness, np.finfo(float).tiny)))
 
@@ -233,6 +232,14 @@ def _rigid_rank(unknowns: Unknowns, fixed: Mask) -> int:
     turns = np.cross(np.eye(3), x[:, None])[np.arange(len(node)), :, component]
     rows = np.concatenate(unknowns.comm.allgather(np.hstack([np.eye(3)[component], turns])))
     return int(np.linalg.matrix_rank(rows))
+
+
+def _stiffness(lattice: Lattice) -> float:
+    """Return the sum of the stiffnesses [N/m] of this rank's springs, or of the springs of L."""
+    if lattice.solid is None:
+        return float(lattice.stiffness[: lattice.springs_owned].sum())
+    bounds = lattice.solid.bounds[: lattice.cells_owned]
+    return float(4 / 3 * bounds.sum() / lattice.cell_size**2)
 
 
 def refuse_free_bodies(unknowns: Unknowns) -> None:

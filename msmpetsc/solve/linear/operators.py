@@ -171,7 +171,7 @@ def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, prefix: str =
     Raises InputError if the nonzeros exceed PETSc's integers, or if the matrix type computes on
     another device than the run.
     """
-    lattice = unknowns.lattice
+    lattice = unknowns.lattice.with_springs()
     row, free = np.full(len(lattice.nodes), -1), to_host(unknowns.free)
     row[free] = np.arange(unknowns.size)
     weight = time_step**2 * lattice.stiffness

@@ -14,6 +14,7 @@ matrices as products P^T H P. All levels but the coarsest multiply in single pre
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from petsc4py import PETSc
@@ -68,7 +69,6 @@ class Multigrid:
     levels : coarse levels, the finest first
     coarse : single-precision products of all coarse levels but the last; empty on a GPU
     bounds : largest eigenvalue of D^-1 H of each level but the coarsest, the finest level first
-    sizes  : nodes and nonzeros of all levels, the finest first, as if all were assembled
 
     Raises InputError for options that do not fit the lattice.
     """
@@ -85,7 +85,6 @@ class Multigrid:
             self.owned.close()
             raise
         self.coarse: list[CoarseOperator] = []
-        self.sizes: list[tuple[int, int]] = []
         self.bounds = [0.0] * len(self.levels)
         self.contact = CoarseContact(
             unknowns, [level.interpolation for level in self.levels], time_step**2
@@ -170,11 +169,14 @@ class Multigrid:
             set_chebyshev(self.pc.getMGSmoother(len(self.levels) - i), RANGE_START * bound, bound)
         if is_new:
             self._read_options()
-            self.sizes = self._sizes()
 
-    def _sizes(self) -> list[tuple[int, int]]:
-        """Return the nodes and the nonzeros of all levels, the finest first (collective)."""
-        unknowns, lattice = self.unknowns, self.unknowns.lattice
+    @cached_property
+    def sizes(self) -> list[tuple[int, int]]:
+        """Return the nodes and nonzeros of all levels, the finest first, as if all were assembled.
+
+        Pairs of nodes in a cell are counted by springs.
+        """
+        unknowns, lattice = self.unknowns, self.unknowns.lattice.with_springs()
         is_free = unknowns.numbers[to_host(lattice.springs)[: lattice.springs_owned]] >= 0
         pairs = unknowns.comm.allreduce(int(is_free.all(axis=1).sum()))
         total = PETSc.Mat.InfoType.GLOBAL_SUM
@@ -186,7 +188,7 @@ class Multigrid:
 
     def __repr__(self) -> str:
         """Return a table of the levels, as ``-ksp_view`` shows it."""
-        if not self.sizes:
+        if self.pc.getType() is None:
             return f"multigrid of {1 + len(self.levels)} levels, not built yet"
         nonzeros = [number for _, number in self.sizes]
         complexity = f"operator complexity {sum(nonzeros) / nonzeros[0]:.3f}"

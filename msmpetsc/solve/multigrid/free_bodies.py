@@ -1,7 +1,7 @@
 """Separate bodies in multigrid, and exact translations of free bodies.
 
-A body is a set of free nodes joined by springs. Pinned nodes separate bodies. Each body has its own
-coarse grids. With T the translations of the free bodies and Q = T (T^T M T)^-1 T^T M, a cycle B
+A body is a set of free nodes joined by springs or cells. Pinned nodes separate bodies. Each body
+has its own coarse grids. With T the translations of the free bodies and Q = T (T^T M T)^-1 T^T M, a cycle B
 becomes
 
     (I - Q) B (I - Q)^T + T (T^T M T)^-1 T^T.
@@ -52,18 +52,21 @@ class Bodies:
 def bodies_of(unknowns: Unknowns) -> Bodies:
     """Return the bodies of a lattice (collective)."""
     comm, lattice = unknowns.comm, unknowns.lattice
-    moves, springs = ~to_host(lattice.pinned), lattice.springs
-    both, either = moves[springs].all(axis=1), moves[springs].any(axis=1)
-    joined = springs[both]
-    graph = coo_array(
-        (np.ones(len(joined), np.int8), (joined[:, 0], joined[:, 1])), shape=(len(moves),) * 2
-    )
+    moves = ~to_host(lattice.pinned)
+    groups = to_host(lattice.local_cells) if lattice.solid else lattice.springs
+    moving = moves[groups]
+    first = moving.argmax(axis=1)
+    others = moving.copy()
+    others[np.arange(len(groups)), first] = False
+    group, place = np.nonzero(others)
+    joined = groups[group, first[group]], groups[group, place]
+    graph = coo_array((np.ones(len(group), np.int8), joined), shape=(len(moves),) * 2)
     part = connected_components(graph, directed=False)[1]
     label = _labels(unknowns, part)
     table = SortedKeys(comm, label[: lattice.owned][moves[: lattice.owned]])
     number = np.where(moves, table.find(np.where(moves, label, -1)), -1)
     fixed = np.zeros((table.total, 3), bool)
-    ends = springs[either & ~both]
+    ends = groups[moving.any(axis=1) & ~moving.all(axis=1)]
     fixed[number[ends[moves[ends]]]] = True
     node, component = map(to_host, lattice.rollers)
     fixed[number[node], component] = True

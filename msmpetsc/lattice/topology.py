@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Indices, Mask, Rows
+from msmpetsc.backend.arrays import Array, Indices, Mask, Rows
 from msmpetsc.backend.kernel import njit
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.geometry.grid import CORNERS
@@ -29,7 +29,7 @@ class SpringNet(NamedTuple):
     ends: Indices
     owned: int
     slot: Indices
-    sharing: Indices
+    sharing: Array
 
     @property
     def direction(self) -> Indices:
@@ -149,7 +149,7 @@ def slots(owned: int, further: int) -> tuple[Indices, Indices]:
 @njit()
 def _neighbours(
     cells: Indices, numbers: Indices, owned: int, further: int
-) -> tuple[Indices, Indices, Indices, int, int]:
+) -> tuple[Indices, Indices, Array, int, int]:
     """Return the neighbours of nodes in cells.
 
     cells   : (d, 8) local corner nodes; nodes below ``owned`` are owned
@@ -184,7 +184,7 @@ def _neighbours(
 @njit()
 def _springs(
     cells: Indices, numbers: Indices, owned: int, further: int
-) -> tuple[Indices, int, Indices, Indices]:
+) -> tuple[Indices, int, Indices, Array]:
     """Return the fields of SpringNet; the arguments are those of ``_neighbours``."""
     neighbour, following, sharing, count, _ = _neighbours(cells, numbers, owned, further)
     springs = np.empty((count, 2), np.int32)

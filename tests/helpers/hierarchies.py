@@ -12,7 +12,7 @@ import numpy as np
 from lattices import ORIGIN, block, cages_of
 from mpi4py import MPI
 from petsc4py import PETSc
-from scipy.sparse import csr_array
+from scipy.sparse import bsr_array, csr_array
 
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.geometry.morton import decode_morton
@@ -252,7 +252,13 @@ class Case:
         return p[np.concatenate(rows).ravel()]
 
     def level(self, level: int) -> np.ndarray:
-        return self.gathered(self.multigrid.levels[level].matrix)
+        """The matrix of a coarse level, on every rank."""
+        blocks = self.multigrid.coarse_blocks(self.q, self.blocks)[level]
+        pattern = self.multigrid.levels[level].pattern
+        begin, columns, _ = pattern.getValuesCSR()
+        shape = 3 * (len(begin) - 1), 3 * pattern.getSize()[1]
+        own = bsr_array((blocks.reshape(-1, 3, 3), columns, begin), shape).toarray()
+        return np.concatenate(self.comm.allgather(own))
 
     def gathered(self, matrix: PETSc.Mat) -> np.ndarray:
         """A matrix with entries, on every rank."""

@@ -81,18 +81,24 @@ class HighestMode:
         self.mode.destroy()
 
 
-def largest_eigenvalue(matrix: PETSc.Mat, noise: Floats, blocks: object | None = None) -> float:
+def largest_eigenvalue(
+    matrix: PETSc.Mat,
+    noise: Floats,
+    blocks: object | None = None,
+    of_diagonal: PETSc.Mat | None = None,
+) -> float:
     """Return an estimate of the largest eigenvalue of D^-1 H by ten CG iterations (collective).
 
-    noise  : (n,) random numbers of this rank, from 0 to 1
-    blocks : a context of PCPYTHON that applies D^-1, if H is not assembled; otherwise D is the
-             3 x 3 block diagonal of the matrix
+    noise       : (n,) random numbers of this rank, from 0 to 1
+    blocks      : a context of PCPYTHON that applies D^-1; otherwise D is the 3 x 3 block diagonal
+                  of the matrix
+    of_diagonal : matrix whose block diagonal is D, in place of H
     """
     x, b = matrix.createVecs()
     b.array[:] = noise - 0.5
     ksp = PETSc.KSP().create(matrix.comm)
     ksp.setType(PETSc.KSP.Type.CG)
-    ksp.setOperators(matrix)
+    ksp.setOperators(matrix, of_diagonal or matrix)
     ksp.getPC().setType(PETSc.PC.Type.PYTHON if blocks else PETSc.PC.Type.PBJACOBI)
     if blocks:
         ksp.getPC().setPythonContext(blocks)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Array, Floats, Indices, Mask
+from msmpetsc.backend.arrays import Array, Indices, Mask, Rows
 from msmpetsc.backend.kernel import njit
 
 
@@ -14,7 +14,7 @@ class BlockRows(NamedTuple):
 
     begin   : (n + 1,) row i has the blocks begin[i] to begin[i + 1]
     columns : (k,) column of each block
-    place   : (k,) index of each block's first number in the values of the AIJ
+    place   : (k,) place of each block in the whole matrix
     values  : (k, 9) float32
     """
 
@@ -24,73 +24,67 @@ class BlockRows(NamedTuple):
     values: Array
 
     @classmethod
-    def chosen(
-        cls, chosen: Mask, rows: int, row: Indices, columns: Indices, place: Indices
-    ) -> "BlockRows":
+    def chosen(cls, chosen: Mask, rows: int, row: Indices, columns: Indices) -> "BlockRows":
         """Return the blocks (b,) that a mask chooses, without values."""
         begin = np.searchsorted(row[chosen], np.arange(rows + 1))
-        values = np.empty((chosen.sum(), 9), np.float32)
-        return cls(begin, columns[chosen].astype(np.int32), place[chosen], values)
+        place = np.flatnonzero(chosen).astype(np.int32)
+        values = np.empty((len(place), 9), np.float32)
+        return cls(begin, columns[chosen].astype(np.int32), place, values)
 
 
 class CoarseOperator:
     """Apply the matrix H of a coarse level in single precision. All methods are collective.
 
     Memory bandwidth limits a product. Therefore only the upper triangle is kept, in single
-    precision and with an index for each block: 0.6 kB a node instead of 2.9 kB of the AIJ. The
+    precision and with an index for each block: 0.6 kB a node instead of 2.9 kB of an AIJ. The
     blocks act on differences of nodes, and the sums of the rows act on the nodes. Thus a
     translation keeps its digits, even if H is stiff.
 
-    matrix   : AIJ of block size 3, symmetric, with full blocks
+    pattern  : symmetric AIJ of the nodes, with an entry for each block
     operator : MATPYTHON with this context
     own      : upper triangle of the columns on this rank
     remote   : blocks whose columns are ghosts
     sums     : (n, 9) sums of the rows' blocks
     """
 
-    def __init__(self, matrix: PETSc.Mat):
-        self.matrix = matrix
-        begin, columns, _ = matrix.getValuesCSR()
-        first, last = (bound // 3 for bound in matrix.getOwnershipRange())
-        self.length = np.diff(begin)[::3]
-        row = np.repeat(np.arange(last - first), self.length // 3)
-        within = 3 * np.arange(len(row)) - np.concatenate([[0], np.cumsum(self.length)])[row]
-        place = begin[3 * row] + within
-        columns = columns[place] // 3
+    def __init__(self, pattern: PETSc.Mat):
+        self.comm = pattern.comm
+        begin, columns, _ = pattern.getValuesCSR()
+        first, last = pattern.getOwnershipRange()
+        self.begin = begin[:-1]
+        row = np.repeat(np.arange(last - first), np.diff(begin))
         is_own = (columns >= first) & (columns < last)
         ghosts, number = np.unique(columns[~is_own], return_inverse=True)
         self.own = BlockRows.chosen(
-            is_own & (columns > first + row), last - first, row, columns - first, place
+            is_own & (columns > first + row), last - first, row, columns - first
         )
         columns[~is_own] = number
-        self.remote = BlockRows.chosen(~is_own, last - first, row, columns, place)
+        self.remote = BlockRows.chosen(~is_own, last - first, row, columns)
         self.sums = np.empty((last - first, 9), np.float32)
         self.x, self.y = np.empty((2, last - first, 3), np.float32)
         self.ghosts = PETSc.Vec().createSeq(3 * len(ghosts))
-        whole = matrix.createVecRight()
+        sizes = 3 * (last - first), 3 * pattern.getSize()[0]
+        self.operator = PETSc.Mat().createPython((sizes, sizes), self, comm=self.comm)
+        self.operator.setBlockSize(3)
+        self.operator.setUp()
+        whole = self.operator.createVecRight()
         wanted = PETSc.IS().createBlock(3, ghosts.astype(PETSc.IntType))
         self.scatter = PETSc.Scatter().create(whole, wanted, self.ghosts, None)
         whole.destroy()
         wanted.destroy()
-        self.operator = PETSc.Mat().createPython(matrix.getSizes(), self, comm=matrix.comm)
-        self.operator.setBlockSize(3)
-        self.operator.setUp()
 
-    def update(self) -> None:
-        """Copy the present values of the matrix."""
-        begin, _, values = self.matrix.getValuesCSR()
-        self.sums[:] = np.add.reduceat(values.reshape(-1, 3), begin[:-1] // 3, axis=0).reshape(
-            -1, 9
-        )
+    def update(self, blocks: Rows) -> None:
+        """Take the blocks (k, 9) of this rank's rows."""
+        self.sums[:] = np.add.reduceat(blocks, self.begin, axis=0)
         for part in (self.own, self.remote):
-            take_blocks(self.length, part, values)
+            part.values[:] = blocks[part.place]
         self.operator.assemble()
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Write H x to y."""
         self.x[:] = x.array_r.reshape(-1, 3)
         multiply_upper(self.own, self.sums, self.x, self.y)
-        if self.matrix.comm.size > 1:
+        if self.comm.size > 1:
             self.scatter.scatter(x, self.ghosts)
             add_product(
                 self.remote, self.x, self.ghosts.array_r.reshape(-1, 3).astype(np.float32), self.y
@@ -100,16 +94,6 @@ class CoarseOperator:
     def destroy(self, _: PETSc.Mat) -> None:
         self.scatter.destroy()
         self.ghosts.destroy()
-
-
-@njit()
-def take_blocks(length: Indices, blocks: BlockRows, given: Floats) -> None:
-    """Copy the blocks from the values of an AIJ with ``length`` (n,) nonzeros per scalar row."""
-    for i in range(len(blocks.begin) - 1):
-        for k in range(blocks.begin[i], blocks.begin[i + 1]):
-            for r in range(3):
-                for c in range(3):
-                    blocks.values[k, 3 * r + c] = given[blocks.place[k] + r * length[i] + c]
 
 
 @njit(fastmath={"reassoc", "contract", "nsz"})

@@ -4,6 +4,8 @@ An active contact pair is stiff in a single direction of about forty unknowns, a
 move together. Diagonal blocks represent neither, because they fix each node to the ground.
 """
 
+from itertools import zip_longest
+
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -93,27 +95,30 @@ class CoarseContact:
         self.coarsest: PETSc.Mat | None = None
         self.nonzeros = csr_array((0, 0))
 
-    def added(self, matrices: list[PETSc.Mat], surface: SurfaceHessian | None) -> PETSc.Mat:
-        """Add contact to the matrices of the coarse levels, and return the coarsest with contact.
+    def added(
+        self, coarsest: PETSc.Mat, blocks: list[Rows], surface: SurfaceHessian | None
+    ) -> PETSc.Mat:
+        """Return the coarsest matrix with contact; it does not change itself.
 
-        The coarsest matrix itself does not change.
+        blocks : diagonal blocks (n, 9) of each level but the coarsest, which contact is added to
         """
         if surface is None:
-            return matrices[-1]
+            return coarsest
         self.scalar = self.scalar or self._scalar()
         weights = surface.weights[:, self.unknowns.free]
-        for matrix, p in zip(matrices, self.scalar, strict=True):
+        for p, diagonal in zip_longest(self.scalar, blocks):
             # The order of the ranks makes the sum reproducible.
             whole = sum(surface.comm.allgather(weights @ p))
-            first, last = (bound // 3 for bound in matrix.getOwnershipRange())
-            weights = csr_array(whole[:, first:last])
-            if matrix is not matrices[-1]:
+            count = coarsest.getLocalSize()[0] // 3 if diagonal is None else len(diagonal)
+            first = surface.comm.exscan(count) or 0  # type: ignore[attr-defined]
+            weights = csr_array(whole[:, first : first + count])
+            if diagonal is not None:
                 own = SurfaceHessian(surface.comm, weights, surface.points)
-                add_diagonal(matrix, self.t2 * own.blocks)
+                diagonal += self.t2 * own.blocks
         joined = kron(weights, eye_array(3), "csr").T @ (
             surface.points @ kron(whole, eye_array(3), "csr")
         )
-        return self._coarsest(matrices[-1], csr_array(joined))
+        return self._coarsest(coarsest, csr_array(joined))
 
     def _coarsest(self, without: PETSc.Mat, contact: csr_array) -> PETSc.Mat:
         """Return the coarsest matrix plus t^2 times contact.
@@ -161,15 +166,6 @@ class CoarseContact:
         if self.coarsest:
             self.coarsest.destroy()
             self.coarsest = None
-
-
-def add_diagonal(matrix: PETSc.Mat, blocks: Rows) -> None:
-    """Add 3 x 3 blocks (n, 9) to the diagonal of this rank's rows of a matrix (collective)."""
-    first, last = (bound // 3 for bound in matrix.getOwnershipRange())
-    begin = np.arange(len(blocks) + 1, dtype=PETSc.IntType)
-    columns = np.arange(first, last, dtype=PETSc.IntType)
-    matrix.setValuesBlockedIJV(begin, columns, blocks.reshape(-1, 3, 3), addv=True)
-    matrix.assemble()
 
 
 def aij(rows: csr_array, like: PETSc.Mat) -> PETSc.Mat:

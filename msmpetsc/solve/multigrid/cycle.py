@@ -7,8 +7,9 @@ The hierarchy uses the projected Hessian H, which is positive definite at any po
 CG with the true Hessian has a positive definite preconditioner. The finest level applies H spring
 by spring or cell by cell in single precision, with a block diagonal D in its smoother. The first
 coarse matrix is summed in the same way (solve.multigrid.galerkin). PETSc computes the coarser
-matrices as products P^T H P. All levels but the coarsest multiply in single precision
-(solve.multigrid.coarse_products).
+matrices as products P^T H P. P is the same for x, y and z, so PETSc multiplies the nine entries of
+the blocks one after the other, each as a matrix of the nodes. All levels but the coarsest multiply
+in single precision (solve.multigrid.coarse_products).
 """
 
 from collections.abc import Iterator
@@ -18,8 +19,9 @@ from functools import cached_property
 
 import numpy as np
 from petsc4py import PETSc
+from scipy.sparse import bsr_array
 
-from msmpetsc.backend.arrays import Positions, Rows, to_host
+from msmpetsc.backend.arrays import Indices, Positions, Rows, to_host
 from msmpetsc.contact.surface.surface_contact import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.errors import InputError
@@ -32,7 +34,7 @@ from msmpetsc.solve.multigrid.coarse_products import CoarseOperator
 from msmpetsc.solve.multigrid.contact import CoarseContact
 from msmpetsc.solve.multigrid.finest_level import DiagonalBlocks, ProjectedHessian
 from msmpetsc.solve.multigrid.free_bodies import bodies_of
-from msmpetsc.solve.multigrid.galerkin import GalerkinSum, set_block_size
+from msmpetsc.solve.multigrid.galerkin import GalerkinSum
 from msmpetsc.solve.multigrid.grids import CoarseGrid, grids, interpolation, node_keys
 from msmpetsc.solve.petsc import device
 from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev
@@ -53,11 +55,28 @@ TRANSPOSES_SQUARE = (3, 19)
 
 @dataclass(frozen=True)
 class Level:
-    """Coarse level: grid, interpolation P to the next finer level, matrix (AIJ, block size 3)."""
+    """Coarse level.
+
+    grid          : its nodes
+    interpolation : P (AIJ) to the next finer level
+    scalar        : P (AIJ) of a single coordinate; None for the first coarse level
+    pattern       : AIJ of the nodes, with an entry for each block of the level's matrix
+    matrix        : the level's matrix (AIJ of block size 3). If CoarseOperator multiplies in its
+                    place, it has the diagonal blocks alone
+    """
 
     grid: CoarseGrid
     interpolation: PETSc.Mat
+    scalar: PETSc.Mat | None
+    pattern: PETSc.Mat
     matrix: PETSc.Mat
+
+    @property
+    def diagonal(self) -> Indices:
+        """Places (n,) of the diagonal blocks in the level's matrix."""
+        begin, columns, _ = self.pattern.getValuesCSR()
+        own = np.repeat(self.grid.table.first + np.arange(len(begin) - 1), np.diff(begin))
+        return np.flatnonzero(columns == own)
 
 
 class Multigrid:
@@ -127,10 +146,18 @@ class Multigrid:
         levels: list[Level] = []
         for grid in coarse:
             p = interpolation(comm, keys, rows, sizes, grid, unknowns.memory.mat_type)
-            self.owned.callback(p.destroy)
-            levels.append(Level(grid, p, PETSc.Mat() if levels else galerkin.matrix))
-            self.owned.callback(levels[-1].matrix.destroy)
-            keys, sizes = grid.table.keys, grid.sizes
+            scalar, pattern = None, galerkin.pattern
+            if levels:
+                finer = levels[-1].grid.sizes(1)
+                scalar = interpolation(
+                    comm, keys, rows[:, :1] // 3, finer, grid, unknowns.memory.mat_type
+                )
+                self.owned.callback(scalar.destroy)
+                pattern = PETSc.Mat()
+            levels.append(Level(grid, p, scalar, pattern, PETSc.Mat()))
+            for owned in (p, pattern, levels[-1].matrix):
+                self.owned.callback(owned.destroy)
+            keys, sizes = grid.table.keys, grid.sizes(3)
             rows = 3 * np.arange(len(keys))[:, None] + np.arange(3)
         return galerkin, levels
 
@@ -145,26 +172,35 @@ class Multigrid:
         contact = contact + remaining.blocks if remaining else contact
         self.fine.update(q, contact, joined)
         self.operator.assemble()
-        self.sum.update(q, contact)
-        self._raise_diagonal(self.sum.matrix)
-        for finer, level in zip(self.levels, self.levels[1:], strict=False):
-            self._galerkin_product(finer, level)
-            self._raise_diagonal(level.matrix)
-        coarsest = self.contact.added([level.matrix for level in self.levels], joined)
+        blocks = self.coarse_blocks(q, contact)
         is_new = self.pc.getType() is None
         if is_new and self.unknowns.memory is not device.CUDA:
-            self.coarse = [CoarseOperator(level.matrix) for level in self.levels[:-1]]
+            self.coarse = [CoarseOperator(level.pattern) for level in self.levels[:-1]]
             for coarse in self.coarse:
                 self.owned.callback(coarse.operator.destroy)
-        for coarse in self.coarse:
-            coarse.update()
+        for level, of_level in list(zip(self.levels, blocks, strict=True))[len(self.coarse) :]:
+            begin, columns, _ = level.pattern.getValuesCSR()
+            set_blocks(level.matrix, level.pattern, begin, columns, of_level)
+        diagonals = [
+            of_level[level.diagonal]
+            for level, of_level in zip(self.levels, blocks[:-1], strict=False)
+        ]
+        coarsest = self.contact.added(self.levels[-1].matrix, diagonals, joined)
+        for coarse, level, of_level, diagonal in zip(
+            self.coarse, self.levels, blocks, diagonals, strict=False
+        ):
+            of_level[level.diagonal] = diagonal
+            coarse.update(of_level)
+            own = level.grid.table.first + np.arange(len(diagonal))
+            set_blocks(level.matrix, level.pattern, np.arange(len(own) + 1), own, diagonal)
         if is_new:
             self._create_cycle()
         self.pc.getMGCoarseSolve().setOperators(coarsest, coarsest)
         self.bounds[0] = self._finest_bound()
         for i, level in enumerate(self.levels[:-1], 1):
             noise = uniform(level.grid.table.first + np.arange(len(level.grid.table.keys))).ravel()
-            self.bounds[i] = SAFETY * largest_eigenvalue(level.matrix, noise)
+            matrix = self.coarse[i - 1].operator if self.coarse else level.matrix
+            self.bounds[i] = SAFETY * largest_eigenvalue(matrix, noise, of_diagonal=level.matrix)
         for i, bound in enumerate(self.bounds):
             set_chebyshev(self.pc.getMGSmoother(len(self.levels) - i), RANGE_START * bound, bound)
         if is_new:
@@ -181,7 +217,7 @@ class Multigrid:
         pairs = unknowns.comm.allreduce(int(is_free.all(axis=1).sum()))
         total = PETSc.Mat.InfoType.GLOBAL_SUM
         coarse = [
-            (level.grid.table.total, int(level.matrix.getInfo(total)["nz_used"]))
+            (level.grid.table.total, 9 * int(level.pattern.getInfo(total)["nz_used"]))
             for level in self.levels
         ]
         return [(unknowns.total, 9 * (unknowns.total + 2 * pairs)), *coarse]
@@ -219,19 +255,34 @@ class Multigrid:
             self.fine.take_contact(contact)
         return bound
 
-    def _galerkin_product(self, finer: Level, level: Level) -> None:
-        """Compute P^T H P of a level from the matrix of the next finer coarse level."""
-        is_new = not level.matrix
+    def coarse_blocks(self, q: Positions, contact: Rows) -> list[Rows]:
+        """Return the blocks (k, 9) of the matrix of each coarse level, in the pattern's order.
+
+        contact : (owned, 9) or (0, 9) [N/m] Hessian of contact of each node
+        """
+        of_pairs, blocks = self.sum.blocks_at(q, contact), list[Rows]()
+        for entry in range(9):
+            self.sum.set_entries(of_pairs, entry)
+            for i, level in enumerate(self.levels):
+                if i > 0:
+                    self._galerkin_product(self.levels[i - 1].pattern, level)
+                if entry % 4 == 0:
+                    self._raise_diagonal(level.pattern)
+                values = level.pattern.getValuesCSR()[2]
+                if entry == 0:
+                    blocks.append(np.empty((len(values), 9)))
+                blocks[i][:, entry] = values
+        return blocks
+
+    def _galerkin_product(self, finer: PETSc.Mat, level: Level) -> None:
+        """Compute P^T H P of a level from an entry of the next finer coarse level's blocks."""
         with ExitStack() as options:
-            for name, value in self._product_options(finer.matrix) if is_new else ():
+            for name, value in () if level.pattern else self._product_options(finer):
                 options.enter_context(replaced_option(name, value))
-            finer.matrix.ptap(level.interpolation, level.matrix)
-        if is_new:
-            set_block_size(level.matrix)
-            level.matrix.setOption(PETSc.Mat.Option.SPD, True)
+            finer.ptap(level.scalar, level.pattern)
 
     def _raise_diagonal(self, matrix: PETSc.Mat) -> None:
-        """Increase the diagonal of a coarse matrix by RAISED, to make it positive definite.
+        """Increase a diagonal of a coarse matrix by RAISED, to make it positive definite.
 
         A coarse cell with few fine nodes has linearly dependent columns. The increase fixes coarse
         nodes to the ground. It must be small for a held slender body, whose bending is as soft. A
@@ -311,6 +362,33 @@ class Multigrid:
     def destroy(self) -> None:
         """Destroy all PETSc objects (collective)."""
         self.owned.close()
+
+
+def set_blocks(
+    matrix: PETSc.Mat, pattern: PETSc.Mat, begin: Indices, columns: Indices, blocks: Rows
+) -> None:
+    """Set a matrix (AIJ of block size 3) to blocks, and create it first if it is new (collective).
+
+    pattern : a matrix of the nodes, of the same type
+    begin   : (n + 1,) row i has the blocks (k, 9) from begin[i] to begin[i + 1]
+    columns : (k,) column of each block
+    """
+    shape = len(begin) - 1, pattern.getSize()[1]
+    rows = bsr_array((blocks.reshape(-1, 3, 3), columns, begin), 3 * np.array(shape)).tocsr()
+    csr = *(part.astype(PETSc.IntType) for part in (rows.indptr, rows.indices)), rows.data
+    if matrix:
+        matrix.setValuesCSR(*csr)
+        matrix.assemble()
+        return
+    matrix.create(pattern.comm)
+    matrix.setSizes(3 * np.array(pattern.getSizes()))
+    matrix.setBlockSize(3)
+    matrix.setType(pattern.getType())
+    matrix.setOption(PETSc.Mat.Option.SPD, True)
+    matrix.setPreallocationCSR(csr)
+    # PETSc gives the diagonal part of a parallel matrix no block size, but pbjacobi
+    # inverts it.
+    matrix.getDiagonalBlock().setBlockSize(3)
 
 
 class Restriction:

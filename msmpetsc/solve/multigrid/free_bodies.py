@@ -1,8 +1,8 @@
 """Separate bodies in multigrid, and exact translations of free bodies.
 
 A body is a set of free nodes joined by springs or cells. Pinned nodes separate bodies. Each body
-has its own coarse grids. With T the translations of the free bodies and Q = T (T^T M T)^-1 T^T M, a cycle B
-becomes
+has its own coarse grids. With T the translations of the free bodies and
+Q = T (T^T M T)^-1 T^T M, a cycle B becomes
 
     (I - Q) B (I - Q)^T + T (T^T M T)^-1 T^T.
 

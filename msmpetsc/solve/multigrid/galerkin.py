@@ -45,6 +45,8 @@ from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo
 PINNED = 27
 # the upper triangle in a 3 x 3 block, and the diagonal in the upper triangle
 UPPER, DIAGONAL = [0, 1, 2, 4, 5, 8], [0, 3, 5]
+# place in a 3 x 3 block of each entry of its transpose
+TRANSPOSED = [0, 3, 6, 1, 4, 7, 2, 5, 8]
 # stiffness of the spring that holds a component on coarse levels, over its node's [-];
 # the coarse matrix must not be much softer than the components that move
 GROUND = 100.0
@@ -152,7 +154,7 @@ class GalerkinSum:
     offsets : (l,) key of the offset of each node's body (free_bodies.Bodies.offsets)
     copies  : (l, 8) copies of each node's parents (multigrid.coarse_copies)
     stiff   : (owned,) stiffness of each node at rest [N/m]
-    matrix  : AIJ of block size 3; it has values after the first ``update``
+    pattern : AIJ of the nodes, with an entry for each block
     """
 
     def __init__(
@@ -177,16 +179,15 @@ class GalerkinSum:
             Products(*(like(lattice.nodes, part) for part in products))
             for products in (of_springs, OF_NODES)
         )
-        # Matrix of single nodes [kg] without contact
-        self.own = np.zeros((lattice.owned, 6), like=lattice.nodes)
-        self.own[:, DIAGONAL] = unknowns.ballast[:, None]
+        # Places and stiffnesses [kg] of the springs that hold rollers
         node, component = (rows[lattice.rollers[0] < lattice.owned] for rows in lattice.rollers)
-        self.own[node, like(node, np.array(DIAGONAL))[component]] += GROUND * t2 * stiff[node]
+        self.rollers = node, like(node, np.array(DIAGONAL))[component]
+        self.ground = GROUND * t2 * stiff[node]
         first, second, places = self._pairs(grid, corners)
         self.blocks, self.places = len(first), like(lattice.nodes, places)
         upper = np.flatnonzero(first != second)
         self.upper = like(lattice.nodes, upper)
-        self.matrix = self._create_matrix(grid, first, second, upper)
+        self.pattern = self._create_pattern(grid, first, second, upper)
 
     def _pairs(self, grid: CoarseGrid, corners: Indices) -> tuple[Indices, Indices, Indices]:
         """Return the pairs of nodes (b,), (b,) with a block, and each cell's blocks (c, 36).
@@ -204,29 +205,26 @@ class GalerkinSum:
             places[exists] = shared
         return pairs // grid.table.total, pairs % grid.table.total, places
 
-    def _create_matrix(
+    def _create_pattern(
         self, grid: CoarseGrid, first: Indices, second: Indices, upper: Indices
     ) -> PETSc.Mat:
-        """Return the matrix with blocks of the pairs; ``upper`` adds transposes (collective)."""
+        """Return the matrix with entries of the pairs; ``upper`` adds transposes (collective)."""
         comm = self.unknowns.comm
         refuse_nonzeros(comm, 9 * (len(first) + len(upper)))
-        matrix = PETSc.Mat().create(comm=comm)
-        matrix.setSizes((grid.sizes, grid.sizes))
-        matrix.setBlockSize(3)
-        matrix.setType(self.unknowns.memory.mat_type)
-        matrix.setOption(PETSc.Mat.Option.SPD, True)
-        row, column = (
-            3 * n[:, None] + c
-            for n, c in ((first, np.repeat(range(3), 3)), (second, np.tile(range(3), 3)))
-        )
-        rows = np.concatenate([row.ravel(), column[upper].ravel()])
-        columns = np.concatenate([column.ravel(), row[upper].ravel()])
-        preallocate_coo(matrix, rows, columns)
-        set_block_size(matrix)
-        return matrix
+        pattern = PETSc.Mat().create(comm=comm)
+        pattern.setSizes(2 * ((len(grid.table.keys), grid.table.total),))
+        pattern.setType(self.unknowns.memory.mat_type)
+        rows = np.concatenate([first, second[upper]])
+        preallocate_coo(pattern, rows, np.concatenate([second, first[upper]]))
+        return pattern
 
-    def update(self, q: Positions, contact: Rows) -> None:
-        """Sum the matrix at positions q (l, 3) [m] (collective).
+    def set_entries(self, blocks: Rows, entry: int) -> None:
+        """Set the pattern to an entry, 0 to 8, of the pairs' ``blocks`` (b, 9) (collective)."""
+        below = blocks[self.upper, TRANSPOSED[entry]]
+        set_values_coo(self.pattern, np.concatenate([blocks[:, entry], below]))
+
+    def blocks_at(self, q: Positions, contact: Rows) -> Rows:
+        """Return the blocks (b, 9) of this rank's pairs at positions q (l, 3) [m].
 
         contact : (owned, 9) or (0, 9) [N/m] Hessian of contact of each node
         """
@@ -236,24 +234,19 @@ class GalerkinSum:
         if self.elasticity.springs:
             of_springs = PairSum(symmetric, self.places, self.springs, self.of_springs)
             add_springs(count, q, of_springs, self.elasticity.springs.owned)
-        own = self.own + self.t2 * contact[:, UPPER] if len(contact) else self.own
+        # Matrix of single nodes [kg]
+        own = np.zeros((len(self.unknowns.ballast), 6), like=q)
+        own[:, DIAGONAL] = self.unknowns.ballast[:, None]
+        own[self.rollers] += self.ground
+        if len(contact):
+            own += self.t2 * contact[:, UPPER]
         add_nodes(count, own, PairSum(symmetric, self.places, self.nodes, self.of_nodes))
         into = CellSum(symmetric[:, self.full], self.places, self.cells, self.weights)
         scratch = np.empty((1 if on_host(q) else count, 8, COARSE), like=q)
         hessians: list[CellHessians] = [solid.hessian_at(q, True)] if solid else []
         for hessian in hessians + ([viscosity.hessian] if viscosity else []):
             add_solid(count, scratch, into, one_by_one(hessian.blocks, hessian.state))
-        values = into.values
-        set_values_coo(self.matrix, np.concatenate([values, values[self.upper]]).ravel())
-
-
-def set_block_size(matrix: PETSc.Mat) -> None:
-    """Set block size 3 for a matrix and its diagonal part.
-
-    PETSc gives the diagonal part of a parallel matrix no block size, but pbjacobi inverts it.
-    """
-    matrix.setBlockSize(3)
-    matrix.getDiagonalBlock().setBlockSize(3)
+        return into.values
 
 
 def _by_cell(

@@ -33,10 +33,9 @@ class CoarseGrid:
     table: SortedKeys
     copies: Array
 
-    @property
-    def sizes(self) -> tuple[int, int]:
-        """Return the numbers of coordinates of this rank and of all ranks, interleaved by node."""
-        return 3 * len(self.table.keys), 3 * self.table.total
+    def sizes(self, width: int) -> tuple[int, int]:
+        """Return the numbers of unknowns of this rank and of all ranks, ``width`` for each node."""
+        return width * len(self.table.keys), width * self.table.total
 
 
 def node_keys(unknowns: Unknowns) -> Indices:
@@ -100,9 +99,10 @@ def interpolation(
     """Return the interpolation P (AIJ) from a coarse grid to finer nodes (collective).
 
     keys      : (n,) keys of this rank's finer nodes that are unknowns
-    rows      : (n, 3) local rows of their x, y and z
+    rows      : (n, w) local rows of their w components, 3 or 1
     row_sizes : numbers of rows of this rank and of all ranks
     """
+    width = rows.shape[1]
     parents, needed = parents_of(keys, grid.copies)
     number = np.full(parents.shape, -1)
     number[needed] = grid.table.find(parents[needed])
@@ -113,13 +113,13 @@ def interpolation(
     columns, values = np.empty(begin[-1], PETSc.IntType), np.empty(begin[-1])
     slot = np.cumsum(needed, axis=1) - 1
     node, corner = np.nonzero(needed)
-    for c in range(3):
+    for c in range(width):
         entry = begin[rows[node, c]] + slot[node, corner]
-        columns[entry] = 3 * number[node, corner] + c
+        columns[entry] = width * number[node, corner] + c
         values[entry] = 1 / count[node]
     csr = begin.astype(PETSc.IntType), columns, values
     matrix = PETSc.Mat().create(comm=comm)
-    matrix.setSizes((row_sizes, grid.sizes))
+    matrix.setSizes((row_sizes, grid.sizes(width)))
     matrix.setType(mat_type)
     matrix.setPreallocationCSR(csr)
     matrix.setName("interpolation")

@@ -59,7 +59,7 @@ class Holders:
     @classmethod
     def of_masks(cls, masks: dict[str, Mask], lattice: Lattice) -> "Holders":
         """Return the holders of components (l, 3). A shared one is the first's (collective)."""
-        number = np.full((lattice.owned, 3), len(masks))
+        number = np.full((lattice.owned, 3), len(masks), np.int32)
         for holder, where in reversed([*enumerate(masks.values())]):
             number[where[: lattice.owned]] = holder
         mass = lattice.mass[:, None]

@@ -186,7 +186,9 @@ def build_lattice(
     is_solid = material.poisson is not None
     first_owned = net.cells[:, 0] < len(net.octants)
     further = ~first_owned & is_solid
-    kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(further)])
+    kept: Indices | slice = slice(None)
+    if not first_owned.all():
+        kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(further)])
     springs, make_springs = NO_SPRINGS, None
     if is_solid:
         make_springs = partial(_springs_of_solid, net, h, material, of_cells)

@@ -21,6 +21,7 @@ from msmpetsc.lattice.material import (
 from msmpetsc.lattice.topology import (
     DIRECTION,
     DIRECTION_KIND,
+    Parts,
     SpringNet,
     Topology,
     find_slot,
@@ -74,13 +75,13 @@ def law_of_springs(
     of_cells: MaterialOfCells | None,
 ) -> LawConstants:
     """Return masses and spring stiffnesses; a spring has the mean over the cells that share it."""
-    if of_cells is None and net.fills is None:
+    if of_cells is None and net.cages.fills is None:
         mass: Floats = material.density * h**3 / 8 * net.octants.sum(axis=1)
         law = LawConstants(mass, material.spring, material.spring)
     else:
         owned = len(net.octants)
-        made_of, net = _made_of(net, material, of_cells)
-        fills = np.ones((len(net.cells), 8)) if net.fills is None else net.fills
+        made_of, (fills, _) = _made_of(net, material, of_cells)
+        fills = np.ones((len(net.cells), 8)) if fills is None else fills
         of_pairs = spring_fractions(fills)
         of_corners = made_of.density[:, None] * mass_fractions(of_pairs)
         mass = h**3 / 8 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
@@ -95,24 +96,25 @@ def law_of_springs(
 
 def _made_of(
     net: Topology, material: Material, of_cells: MaterialOfCells | None
-) -> tuple[CellMaterial, Topology]:
+) -> tuple[CellMaterial, Parts]:
     """Return the material of the cells around a rank's nodes, by ``of_cells`` if it is given.
 
-    The fills and moments of the topology returned are those of the cells' stiffness.
+    The fills and moments returned are those of the cells' stiffness (collective).
     """
+    fills, moments = net.parts()
     count = len(net.cells)
     if not of_cells:
         of_all = material.density, material.spring, material.poisson_ratio
         density, spring, poisson = (np.full(count, value) for value in of_all)
-        return CellMaterial(density, spring, poisson), net
+        return CellMaterial(density, spring, poisson), (fills, moments)
     made_of = of_cells(net.keys)
     if made_of.mixed is None or len(made_of.mixed.rows) == 0:
-        return made_of, net
+        return made_of, (fills, moments)
     rows, of_stiffness, moments_of_stiffness = made_of.mixed
-    fills = np.ones((count, 8)) if net.fills is None else net.fills.copy()
-    moments = np.full((count, 3), 1 / 12) if net.moments is None else net.moments.copy()
+    fills = np.ones((count, 8)) if fills is None else fills
+    moments = np.full((count, 3), 1 / 12) if moments is None else moments
     fills[rows], moments[rows] = of_stiffness, moments_of_stiffness
-    return made_of, net._replace(fills=fills, moments=moments)
+    return made_of, (fills, moments)
 
 
 def law_of_solid(
@@ -123,9 +125,9 @@ def law_of_solid(
     A corner's lumped mass is proportional to the diagonal of L, as with springs.
     """
     owned, count = len(net.octants), len(net.cells)
-    made_of, net = _made_of(net, material, of_cells)
+    made_of, parts = _made_of(net, material, of_cells)
     shear, lame = lame_constants(made_of.spring, made_of.poisson)
-    forms, volume, cut = _forms(net)
+    forms, volume, cut = _forms(count, parts)
     diagonal = np.broadcast_to(
         laplacians(WHOLE[None], np.ones(1)).diagonal(axis1=1, axis2=2), (count, 8)
     )
@@ -146,10 +148,11 @@ def stiffness_of_solid(
     of_cells: MaterialOfCells | None,
 ) -> Floats:
     """Return the stiffness (s,) [N/m] of the springs of L of a solid (collective)."""
-    made_of, net = _made_of(net, material, of_cells)
+    made_of, parts = _made_of(net, material, of_cells)
     shear, lame = lame_constants(made_of.spring, made_of.poisson)
-    pairs = np.broadcast_to(laplacians(WHOLE[None], np.ones(1)), (len(net.cells), 8, 8))
-    forms, volume, cut = _forms(net)
+    count = len(net.cells)
+    pairs = np.broadcast_to(laplacians(WHOLE[None], np.ones(1)), (count, 8, 8))
+    forms, volume, cut = _forms(count, parts)
     if len(cut):
         pairs = pairs.copy()
         pairs[cut] = bounding_laplacians(forms[cut], volume[cut])
@@ -157,16 +160,17 @@ def stiffness_of_solid(
     return _sums_of_springs(net, springs, -h * (2 * shear + 3 * lame), pairs)
 
 
-def _forms(net: Topology) -> tuple[Rows, Floats, Indices]:
+def _forms(count: int, parts: Parts) -> tuple[Rows, Floats, Indices]:
     """Return the strain forms (d, 13) and volumes (d,) [cells] of cells, and which are cut."""
-    count = len(net.cells)
     forms, volume = np.broadcast_to(WHOLE, (count, len(WHOLE))), np.ones(count)
-    if net.fills is None or net.moments is None:
+    fills, moments = parts
+    if fills is None or moments is None:
         return forms, volume, np.empty(0, np.int64)
-    cut = np.flatnonzero(net.fills.min(axis=1) < 1)
-    forms = forms.copy()
-    volume[cut] = net.fills[cut].mean(axis=1)
-    forms[cut] = forms_of(net.fills[cut], net.moments[cut])
+    cut = np.flatnonzero(fills.min(axis=1) < 1)
+    if len(cut):
+        forms = forms.copy()
+        volume[cut] = fills[cut].mean(axis=1)
+        forms[cut] = forms_of(fills[cut], moments[cut])
     return forms, volume, cut
 
 

@@ -17,6 +17,10 @@ DIRECTION = (CORNERS[None, :, :] - CORNERS[:, None, :] + 1) @ np.array([9, 3, 1]
 DIRECTION_KIND = ((np.stack(np.unravel_index(np.arange(27), (3, 3, 3))) - 1) ** 2).sum(axis=0)
 
 
+# fills (d, 8) of the corners of cells, and their second moments (d, 3)
+Parts = tuple[Rows | None, Rows | None]
+
+
 class SpringNet(NamedTuple):
     """Springs of a rank, without material; owned springs come first.
 
@@ -45,8 +49,7 @@ class Topology(NamedTuple):
     octants : (owned, 8) bool, which of the 8 cells around each owned node have it as a corner
     keys    : (d,) keys of all cells around the owned nodes
     cells   : (d, 8) their local corner nodes
-    fills   : (d, 8) fills of their corners (geometry.fill_fractions); None if all cells are whole
-    moments : (d, 3) second moments (geometry.fill_fractions); None if all cells are whole
+    cages   : the cells of all ranks
     further : number of further rows of sums, of nodes with several neighbours in a direction
     """
 
@@ -57,14 +60,22 @@ class Topology(NamedTuple):
     ghosts: Indices
     keys: Indices
     cells: Indices
-    fills: Rows | None
-    moments: Rows | None
+    cages: Cages
     further: int
 
     @property
     def _numbers(self) -> Indices:
         """Global number (l,) of each local node."""
         return np.concatenate([self.table.first + np.arange(len(self.octants)), self.ghosts])
+
+    def parts(self) -> Parts:
+        """Return the fills (d, 8) and second moments (d, 3) of the cells (collective).
+
+        Both are None if all cells are whole (geometry.fill_fractions).
+        """
+        fills = self.cages.of_cells(self.keys, self.cages.fills)
+        moments = self.cages.of_cells(self.keys, self.cages.moments)
+        return None if fills is None else fills[:, *CORNERS.T], moments
 
     def count_springs(self) -> int:
         """Return the number of springs that this rank owns."""
@@ -85,14 +96,11 @@ def topology_of(cages: Cages) -> Topology:
     corner_keys = cages.corner_keys(keys)
     node_keys = np.concatenate([table.keys, np.setdiff1d(corner_keys, table.keys)])
     order = np.argsort(node_keys)
-    cells = order[np.searchsorted(node_keys, corner_keys, sorter=order)]
+    cells = order[np.searchsorted(node_keys, corner_keys, sorter=order)].astype(np.int32)
     ghosts = table.find(node_keys[owned:])
-    fills = cages.of_cells(keys, cages.fills)
-    fills = None if fills is None else fills[:, *CORNERS.T]
-    moments = cages.of_cells(keys, cages.moments)
     ijk = decode_morton(node_keys)
     further = (COPIES - 1) * several
-    return Topology(table, corners, ijk, octants, ghosts, keys, cells, fills, moments, further)
+    return Topology(table, corners, ijk, octants, ghosts, keys, cells, cages, further)
 
 
 def _cells_around(cages: Cages, table: SortedKeys) -> tuple[Indices, Mask, int]:

@@ -115,7 +115,7 @@ def _lowest(search: Lobpcg, count: int) -> tuple[Floats, Rows]:
     Raises StepFailed if they do not converge.
     """
     block = count + SPARE
-    start = search.random(block)
+    start = [search.random(block)]
     for _, (values, modes, errors) in zip(
         range(MOST_ITERATIONS), search.iterates(start, block), strict=False
     ):

@@ -16,7 +16,6 @@ A start without a linear solve is tried first: nodes move with the obstacles nea
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TypeAlias
 
 import numpy as np
 from mpi4py import MPI
@@ -28,8 +27,6 @@ from msmpetsc.contact.surface.pairs import ContactSearch
 from msmpetsc.errors import StepFailed, StepStopped
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 from msmpetsc.solve.nonlinear.jacobian import Jacobian
-
-Vectors: TypeAlias = tuple[PETSc.Vec, PETSc.Vec, PETSc.Vec]
 
 # Directions between checks of the progress; a press takes 5 to 30
 PATIENCE = 20
@@ -45,14 +42,11 @@ class CarriedStart:
 
     All methods are collective.
 
-    ksp     : solves with the Jacobian
-    vectors : three vectors of unknowns for temporary values
+    ksp : solves with the Jacobian
     """
 
-    def __init__(
-        self, functional: StepFunctional, jacobian: Jacobian, ksp: PETSc.KSP, vectors: Vectors
-    ):
-        self.functional, self.jacobian, self.ksp, self.vectors = functional, jacobian, ksp, vectors
+    def __init__(self, functional: StepFunctional, jacobian: Jacobian, ksp: PETSc.KSP):
+        self.functional, self.jacobian, self.ksp = functional, jacobian, ksp
         # Tolerances of the options; a direction only has to arrive
         self.rtol, _, _, self.most_its = ksp.getTolerances()
 
@@ -148,11 +142,8 @@ class CarriedStart:
 
         fixed, obstacles : displacements of fixed nodes (l, 3) and obstacles' points (o, 3) [m]
         """
-        functional, unknowns, (x, change, f) = (
-            self.functional,
-            self.functional.unknowns,
-            self.vectors,
-        )
+        functional, unknowns = self.functional, self.functional.unknowns
+        x, change, f = (functional.vectors.take() for _ in range(3))
         contact = functional.problem.contact
         assert contact is not None and contact.surface is not None
         if Stop.agreed(functional.comm):
@@ -172,4 +163,6 @@ class CarriedStart:
         x.scale(-1.0)
         direction = fixed.copy()
         unknowns.to_nodes(x, direction)
+        for vector in (x, change, f):
+            functional.vectors.give_back(vector)
         return direction

@@ -170,11 +170,11 @@ class LowestCurvature:
         if self.mode is None:
             return None
         its = self.effort.followed
-        values, modes = self.search.lowest(self.mode[None], 1, 0, 0)
+        values, modes = self.search.lowest([self.mode[None]], 1, 0, 0)
         if abs(values[0] - self.value) <= UNCHANGED * self.value:
             # The stored curvature stays, so that slow changes add up
             return np.array([self.value]), modes
-        start = np.concatenate([self.mode[None], self.search.random(1)])
+        start = [self.mode[None], self.search.random(1)]
         values, modes = self.search.lowest(start, 2, its, its)
         return None if values[0] > MORE * self.value else (values, modes)
 
@@ -190,18 +190,23 @@ class LowestCurvature:
         """
         is_uniform = effort is UNIFORM_EFFORT
         search, block, least = self.search, effort.block, effort.least
-        start = search.random(block - (is_uniform and self.mode is not None))
-        if hint is not None:
-            start[0] += search.unit(self.functional.memory.read(hint)[None])[0]
         known = [] if self.mode is None else [self.mode[None]]
         rigid = self._rigid_motions(q)
+
+        def noise(count: int) -> Rows:
+            start = search.random(count)
+            if hint is not None:
+                start[0] += search.unit(self.functional.memory.read(hint)[None])[0]
+            return start
+
         # No rigid motion delays a mode, and all modes converge fast
         if rigid is None and is_uniform:
-            return search.lowest(np.concatenate([start, *known]), block, LONGEST_SEARCH, least)
-        start = search.without(rigid, start)
+            start = [noise(block - len(known)), *known]
+            return search.lowest(start, block, LONGEST_SEARCH, least)
+        start = [search.without(rigid, noise(block - is_uniform * len(known)))]
         _, modes = search.lowest(start, block, LONGEST_SEARCH, least, left_out=rigid)
-        begin = [modes, *known, *([] if rigid is None else [rigid])]
-        return search.lowest(np.concatenate(begin), block, LONGEST_SEARCH, least // 2)
+        start = [modes, *known, *([] if rigid is None else [rigid])]
+        return search.lowest(start, block, LONGEST_SEARCH, least // 2)
 
     def _rigid_motions(self, q: Positions) -> Rows | None:
         """Return translations and rotations (6, n) of a free body at positions q (l, 3) [m].
@@ -247,6 +252,3 @@ class LowestCurvature:
     def forget(self) -> None:
         """Forget the mode and its search."""
         self.searched, self.mode = NONE, None
-
-    def destroy(self) -> None:
-        self.search.destroy()

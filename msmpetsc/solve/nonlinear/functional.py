@@ -97,7 +97,6 @@ class StepFunctional:
         self.time_step, self.t2 = time_step, time_step**2
         self.lattice, self.memory = unknowns.lattice, unknowns.memory
         self.mass = np.tile(self.lattice.mass[unknowns.free], 3)
-        self.per_mass = 1 / self.mass
         nodes = self.lattice.nodes
         self.problem = StepProblem(nodes, nodes, np.zeros((self.lattice.owned, 3), like=nodes))
         # Greatest coordinate of the problem's q [m]
@@ -232,11 +231,11 @@ class StepFunctional:
 
         |F|_(M^-1) bounds |x - x*|_M if E is convex: the Hessian of g is then at least M.
         """
-        return float(np.sqrt(self.comm.allreduce(float(self.memory.read(f) ** 2 @ self.per_mass))))
+        return float(np.sqrt(self.comm.allreduce(float((self.memory.read(f) ** 2 / self.mass).sum()))))
 
     def pull(self, f: PETSc.Vec) -> tuple[Indices, Floats]:
         """Return the free nodes, by local number, and |F| / m [m] of each."""
-        columns = (self.memory.read(f) * self.per_mass).reshape(3, -1)
+        columns = (self.memory.read(f) / self.mass).reshape(3, -1)
         return self.unknowns.free, np.sqrt((columns**2).sum(axis=0))
 
     def distance(self, q: Positions, correction: PETSc.Vec | None = None) -> float:

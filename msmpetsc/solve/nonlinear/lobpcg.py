@@ -98,15 +98,16 @@ class Lobpcg:
     ):
         self.functional, self.hessian, self.preconditioner = functional, hessian, preconditioner
         self.comm, self.memory, self.its = functional.comm, functional.memory, 0
-        self.vectors = [functional.unknowns.create_vector() for _ in range(2)]
 
     def random(self, count: int) -> Rows:
         """Return preconditioned noise (count, n), which does not depend on the number of ranks."""
-        return self.unit(self._of_each(self.preconditioner.apply, self.functional.noise(count)))
+        noise = self.functional.noise(count)
+        self._of_each(self.preconditioner.apply, noise, noise)
+        return self.unit(noise)
 
     def lowest(
         self,
-        start: Rows,
+        start: list[Rows],
         block: int,
         most: int,
         least: int,
@@ -114,7 +115,7 @@ class Lobpcg:
     ) -> tuple[Floats, Rows]:
         """Return the lowest eigenvalues (k,), k <= block, of M^(-1) H and their modes (k, n).
 
-        start    : directions (l, n)
+        start    : directions (l, n) in parts, which the search takes out of the list
         most     : most iterations
         least    : fewest iterations
         left_out : directions (r, n), orthonormal in M, that the search leaves out
@@ -130,7 +131,7 @@ class Lobpcg:
         return ritz[0], ritz[1].copy()
 
     def iterates(
-        self, start: Rows, block: int, left_out: Rows | None = None
+        self, start: list[Rows], block: int, left_out: Rows | None = None
     ) -> Iterator[tuple[Floats, Rows, Floats]]:
         """Yield the lowest eigenvalues (k,), their modes (k, n) and errors (k,), without end.
 
@@ -139,7 +140,7 @@ class Lobpcg:
         are those of ``lowest``.
         """
         space = self._space(start, block)
-        values = self._ritz(space, min(block, len(start)))
+        values = self._ritz(space, min(block, space.used))
         # A small body has fewer modes than the block
         size = len(values)
         errors = np.full(size, np.inf)
@@ -152,18 +153,25 @@ class Lobpcg:
             values = self._ritz(space, size)
             self.its += size
 
-    def _space(self, start: Rows, block: int) -> SearchSpace:
-        """Return the space of directions (l, n), with room for the directions of an iteration."""
-        room = max(len(start), 3 * block), start.shape[1]
-        space = SearchSpace(np.empty(room, like=start), np.empty(room, like=start), len(start))
-        space.directions[: len(start)] = start
+    def _space(self, start: list[Rows], block: int) -> SearchSpace:
+        """Return the space of directions, with room for the directions of an iteration.
+
+        start : directions (l, n) in parts, taken out of the list to free their memory
+        """
+        mass = self.functional.mass
+        room = max(sum(map(len, start)), 3 * block), len(mass)
+        space = SearchSpace(np.empty(room, like=mass), np.empty(room, like=mass), 0)
+        while start:
+            part = start.pop(0)
+            space.directions[space.used : space.used + len(part)] = part
+            space.used += len(part)
         self._multiply(space, 0)
         return space
 
     def _multiply(self, space: SearchSpace, first: int) -> None:
         """Compute the products with the directions from the ``first`` on."""
         new = slice(first, space.used)
-        space.products[new] = self._of_each(self.hessian.mult, space.directions[new])
+        self._of_each(self.hessian.mult, space.directions[new], space.products[new])
 
     def _add_residual(self, space: SearchSpace, i: int, value: float) -> float:
         """Add the preconditioned residual of the i-th Ritz vector; return its error r^T P^-1 r."""
@@ -171,8 +179,8 @@ class Lobpcg:
         scale = max(self.comm.allreduce(float(greatest(np.abs(residual))), MPI.MAX), TINY)
         # Multigrid works in single precision
         residual /= scale
-        w = self._of_each(self.preconditioner.apply, residual[None])[0]
-        space.directions[space.used] = w
+        w = space.directions[space.used]
+        self._of_each(self.preconditioner.apply, residual[None], w[None])
         space.used += 1
         error: float = self.comm.allreduce(float(residual @ w)) * scale**2
         return error
@@ -203,22 +211,19 @@ class Lobpcg:
         parts = self.comm.allreduce(to_host((directions * self.functional.mass) @ left_out.T))
         return directions - like(directions, parts) @ left_out
 
-    def _of_each(self, act: Act, directions: Rows) -> Rows:
-        source, product = self.vectors
-        results = np.empty_like(directions)
+    def _of_each(self, act: Act, directions: Rows, results: Rows) -> None:
+        """Write the results (k, n) of an operator on directions (k, n); they may be the same."""
+        vectors = self.functional.vectors
+        source, product = vectors.take(), vectors.take()
         for direction, result in zip(directions, results, strict=True):
             self.memory.write(source)[:] = direction
             act(None, source, product)
             result[:] = self.memory.read(product)
-        return results
+        vectors.give_back(source)
+        vectors.give_back(product)
 
     def unit(self, directions: Rows) -> Rows:
         """Return directions scaled to unit length in the norm of M; zero directions stay zero."""
         squares: Floats = self.comm.allreduce(to_host(directions**2 @ self.functional.mass))
         lengths: Rows = like(directions, np.maximum(np.sqrt(squares), TINY))[:, None]
         return directions / lengths
-
-    def destroy(self) -> None:
-        """Destroy the PETSc vectors (collective)."""
-        for vector in self.vectors:
-            vector.destroy()

@@ -66,7 +66,7 @@ class Optimality:
             curvature,
             rounding,
         )
-        self.memory, self.first = functional.memory, functional.vectors.take()
+        self.memory = functional.memory
 
     def examine(self, at: Iterate, outcome: Outcome, acceptable: float) -> Verdict:
         """Examine g at x - e, or at x if the iterate has no correction e; return the verdict.
@@ -78,11 +78,9 @@ class Optimality:
         functional, estimate, compression = self.functional, self.estimate, outcome.compression
         assert compression is not None
         examined = self._corrected_iterate(at) if outcome.corrected else None
-        corrected, first = examined is not None, self.first
-        estimate.correction.copy(first)
-        if examined is None:
-            examined = at
-            first.set(0.0)
+        corrected = examined is not None
+        length = functional.norm(estimate.correction) if corrected else 0.0
+        examined = examined or at
         estimate.linearise(examined.q, examined.contact)
         estimate.residual.aypx(-1.0, examined.f)
         # Change of F that H at the iterate does not predict
@@ -95,7 +93,7 @@ class Optimality:
             return Verdict(np.inf, examined, direction, value)
         value = min(value, 1.0)
         estimate.convexity = min(estimate.convexity, value)
-        length, rest = functional.norm(first), functional.dual_norm(examined.f) / value
+        rest = functional.dual_norm(examined.f) / value
         # An upper bound if g stays as convex
         if value > CONVEX and length + rest <= acceptable:
             return Verdict(

@@ -127,10 +127,7 @@ class Stepper:
                 self.snes, self.ksp = self._create_solvers()
                 self.control, self.optimality = self._create_control()
                 self.method = self._create_method()
-                take = self.functional.vectors.take
-                self.carried_start = CarriedStart(
-                    self.functional, self.jacobian, self.ksp, (take(), take(), take())
-                )
+                self.carried_start = CarriedStart(self.functional, self.jacobian, self.ksp)
         except InputError:
             self.destroy()
             raise
@@ -180,7 +177,7 @@ class Stepper:
         functional, jacobian = self.functional, self.jacobian
         hessian, preconditioner = jacobian.hessian, jacobian.preconditioner
         estimate = self._keep(ErrorEstimate(functional, hessian, preconditioner, self.prefix))
-        curvature = self._keep(LowestCurvature(functional, hessian, preconditioner))
+        curvature = LowestCurvature(functional, hessian, preconditioner)
         rounding = Rounding(functional, jacobian.diagonal)
         optimality = Optimality(functional, estimate, curvature, rounding)
         error = self.error

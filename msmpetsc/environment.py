@@ -1,6 +1,7 @@
 """The actions on a body at a given time: forces, anchors, obstacles and surface contact."""
 
 from collections.abc import Callable
+from functools import cached_property
 from typing import Any
 
 from mpi4py import MPI
@@ -14,6 +15,7 @@ from msmpetsc.contact.obstacles.node_obstacles import NodeObstacles
 from msmpetsc.contact.step_contact import StepContact
 from msmpetsc.contact.surface.pairs import CandidateCache, ContactSearch, ContactSummary
 from msmpetsc.contact.surface.surface_contact import SurfaceContact
+from msmpetsc.elasticity.energy import Elasticity
 
 # ratio of the normal force at a step's end to the force that limited friction; beyond
 # it, in either direction, the step is solved again with the new limit
@@ -53,6 +55,11 @@ class Environment:
         self._ended: tuple[Positions, StepContact] | None = None
         self.touches = bool(model.penalties or self.self_contact)
         self.system_monitor: Callable[[Any, Any], None] | None = None
+
+    @cached_property
+    def elasticity(self) -> Elasticity:
+        """Elastic energy of the model's lattice."""
+        return Elasticity(self.lattice)
 
     def events(self) -> list[float]:
         """Return the times [s] at which a load or path starts, stops or changes its slope."""

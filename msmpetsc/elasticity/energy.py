@@ -24,10 +24,11 @@ class Elasticity:
     Gradients and products are complete in the owned rows.
     """
 
-    def __init__(self, lattice: Lattice):
+    def __init__(self, lattice: Lattice, solid: NeoHookean | None = None):
+        """Take the solid of another lattice with the same cells, to share its memory, or make it."""
         self.owned, self.rest = lattice.owned, lattice.nodes
         self.springs: SpringScatter | SpringGather | None = None
-        self.solid = None if lattice.solid is None else NeoHookean.of_lattice(lattice)
+        self.solid = solid or (NeoHookean.of_lattice(lattice) if lattice.solid else None)
         self.viscosity: Viscosity | None = None
         if self.solid and lattice.viscous:
             self.viscosity = Viscosity(self.solid, lattice.viscous, lattice.owned, lattice.nodes)

@@ -85,7 +85,8 @@ def _about(
     lattice = environment.lattice.pin(environment.anchors.fixed_at(time))
     comm, tau = lattice.table.comm, SLENDER * time_of_sound(lattice)
     preset = find_preset("newton-multigrid")
-    stepper = Stepper(comm, lattice, tau, preset, touches=environment.touches)
+    touches, solid = environment.touches, environment.elasticity.solid
+    stepper = Stepper(comm, lattice, tau, preset, touches=touches, solid=solid)
     try:
         functional, unknowns = stepper.functional, stepper.unknowns
         if count + SPARE > unknowns.total:

@@ -131,7 +131,8 @@ class TimeLoop:
         points = probe_points(model.bodies, scene.output.probe)
         # ProbePoints may raise: it comes before the first PETSc object.
         self.probe = ProbePoints(comm, model.lattice, points) if points else None
-        self.environment, self.elasticity = Environment(model), Elasticity(model.lattice)
+        self.environment = Environment(model)
+        self.elasticity = self.environment.elasticity
         swings = scene.time.integrator != "implicit-euler"
         self.balance = EnergyBalance(self.environment, self.elasticity, swings)
         self.adaptive: Adaptive | None = None

@@ -283,6 +283,7 @@ class ImplicitEuler(Integrator):
             touches=self.environment.touches,
             prefix=self.prefix,
             static=self.STATIC,
+            solid=self.environment.elasticity.solid,
         )
 
     def _let_go(self, time: float) -> None:

@@ -93,6 +93,7 @@ class TrueHessian:
     """Apply the true Hessian H = M + t^2 (Hessian of E and of contact) spring by spring.
 
     products : number of products so far
+    product  : memory (l, 3) for the forces of a product
     elastic  : Hessian of E at the last positions; None before ``linearise``
     at       : last positions (l, 3) [m], and whether the Hessian is projected
     """
@@ -103,13 +104,14 @@ class TrueHessian:
         elasticity: Elasticity,
         time_step: float,
         contact: ContactBlocks | None = None,
+        product: Rows | None = None,
     ):
         self.unknowns, self.elasticity = unknowns, elasticity
         self.t2, self.contact = time_step**2, contact
         lattice = unknowns.lattice
         # The rows of pinned nodes stay zero.
         self.v = np.zeros_like(lattice.nodes)
-        self.product = np.empty_like(lattice.nodes)
+        self.product = np.empty_like(lattice.nodes) if product is None else product
         self.elastic: Hessian | None = None
         self.at = lattice.nodes, False
         self.surface: SurfaceHessian | None = None

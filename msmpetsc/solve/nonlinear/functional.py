@@ -102,7 +102,8 @@ class StepFunctional:
         # Greatest coordinate of the problem's q [m]
         self.extent = 0.0
         self.vectors = VectorPool(unknowns)
-        self._gradient = np.empty_like(nodes)
+        # Gradients, and products with the Hessian, each used at once
+        self.scratch = np.empty_like(nodes)
 
     def begin(self, problem: StepProblem) -> None:
         """Take the data of a new step."""
@@ -124,7 +125,7 @@ class StepFunctional:
 
         q : positions (l, 3) [m] of x if they are known
         """
-        problem, gradient, owned = self.problem, self._gradient, self.lattice.owned
+        problem, gradient, owned = self.problem, self.scratch, self.lattice.owned
         with GRADIENT:
             q = self.positions(x) if q is None else q
             gradient[:] = 0
@@ -231,7 +232,9 @@ class StepFunctional:
 
         |F|_(M^-1) bounds |x - x*|_M if E is convex: the Hessian of g is then at least M.
         """
-        return float(np.sqrt(self.comm.allreduce(float((self.memory.read(f) ** 2 / self.mass).sum()))))
+        return float(
+            np.sqrt(self.comm.allreduce(float((self.memory.read(f) ** 2 / self.mass).sum())))
+        )
 
     def pull(self, f: PETSc.Vec) -> tuple[Indices, Floats]:
         """Return the free nodes, by local number, and |F| / m [m] of each."""

@@ -57,7 +57,11 @@ class Jacobian:
         )
         self.diagonal = self._diagonal()
         self.hessian = TrueHessian(
-            self.unknowns, elasticity, functional.time_step, self._contact_blocks()
+            self.unknowns,
+            elasticity,
+            functional.time_step,
+            self._contact_blocks(),
+            functional.scratch,
         )
         # Contact's blocks beside A
         self.blocks = None if true_hessian else self._contact_blocks()

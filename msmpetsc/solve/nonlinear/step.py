@@ -9,6 +9,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.elasticity.energy import Elasticity
+from msmpetsc.elasticity.solid import NeoHookean
 from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.schema import DEFAULT_STEP_ERROR
@@ -88,6 +89,7 @@ class Stepper:
     touches : whether steps may have a ``contact``
     prefix  : of the PETSc options
     static  : whether steps are equilibria; M then weighs errors only
+    solid   : of the lattice's cells, to share its memory; None to make it
 
     Raises InputError for options that contradict each other, on all ranks.
     """
@@ -101,6 +103,7 @@ class Stepper:
     touches: bool = False
     prefix: str = ""
     static: bool = False
+    solid: NeoHookean | None = None
 
     def __post_init__(self) -> None:
         self.budget = self.max_iterations or 0
@@ -111,7 +114,7 @@ class Stepper:
         self.owned = ExitStack()
         self.unknowns = Unknowns(self.comm, self.lattice, self.static)
         self.owned.callback(self.unknowns.destroy)
-        elasticity = Elasticity(self.lattice)
+        elasticity = Elasticity(self.lattice, self.solid)
         of_rank = elasticity.solid.stiffest if elasticity.solid else 0.0
         # Greatest lambda / mu of a cell
         self.stiffest = self.comm.allreduce(of_rank, MPI.MAX)

@@ -1,5 +1,6 @@
 """The machine that a program runs on, and the memory of the process."""
 
+import ctypes
 import platform
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,15 @@ def machine() -> dict[str, Any]:
         "memory": memory,
         "system": platform.platform(terse=True),
     }
+
+
+def return_free_memory() -> None:
+    """Return freed memory to the system, which Open MPI keeps in the process.
+
+    Open MPI sets glibc's allocator so that freed memory stays for ever.
+    """
+    if platform.libc_ver()[0] == "glibc":
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def peak_memory() -> int:

@@ -25,7 +25,7 @@ class Elasticity:
     """
 
     def __init__(self, lattice: Lattice, solid: NeoHookean | None = None):
-        """Take the solid of another lattice with the same cells, to share its memory, or make it."""
+        """Make the energy, or share the ``solid`` of another lattice with the same cells."""
         self.owned, self.rest = lattice.owned, lattice.nodes
         self.springs: SpringScatter | SpringGather | None = None
         self.solid = solid or (NeoHookean.of_lattice(lattice) if lattice.solid else None)

@@ -10,6 +10,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Indices, Positions, Rows, on_host, to_host
+from msmpetsc.backend.machine import return_free_memory
 from msmpetsc.build import Model, to_device
 from msmpetsc.checkpoint import AT_END, Checkpoint
 from msmpetsc.constraints.holders import sums_by
@@ -327,6 +328,7 @@ class TimeLoop:
         try:
             self.integrator.set_up()
             self.saved = self._save()
+            return_free_memory()
         except InputError:
             self.destroy()
             raise

@@ -232,9 +232,8 @@ class StepFunctional:
 
         |F|_(M^-1) bounds |x - x*|_M if E is convex: the Hessian of g is then at least M.
         """
-        return float(
-            np.sqrt(self.comm.allreduce(float((self.memory.read(f) ** 2 / self.mass).sum())))
-        )
+        squares = self.memory.read(f) ** 2 / self.mass
+        return float(np.sqrt(self.comm.allreduce(float(squares.sum()))))
 
     def pull(self, f: PETSc.Vec) -> tuple[Indices, Floats]:
         """Return the free nodes, by local number, and |F| / m [m] of each."""

@@ -69,6 +69,8 @@ class Newton(StepMethod):
         super().__post_init__()
         # The direction of the loop is the correction of the error's estimate
         self.y, self.end = self.control.estimate.correction, self.functional.vectors.take()
+        # SNES would create a vector of its own
+        self.snes.setFunction(None, self.control.estimate.residual)
         self.friction = FrictionDuals()
         self.test = self._create_test()
         self.most_its = self.ksp.getTolerances()[3]

@@ -235,9 +235,11 @@ class LowestCurvature:
 
     def save(self, checkpoint: Checkpoint) -> None:
         """Store all that was found, so that a restart needs no long search."""
-        rows = np.zeros((self.functional.lattice.owned, 3), like=self.functional.lattice.nodes)
+        shape = self.functional.lattice.owned, 3
         self.knows_mode = self.mode is not None
+        rows: Rows = np.broadcast_to(0.0, shape)
         if self.mode is not None:
+            rows = np.zeros(shape, like=self.mode)
             rows[self.unknowns.free] = self.mode.reshape(3, -1).T
         checkpoint.keep({"lowest_mode": rows})
         checkpoint.keep_counts(self)

@@ -129,7 +129,8 @@ class TrueHessian:
         projected : project out the negative curvature of each spring (elasticity.springs)
         duals     : duals of friction, which replace its true curvature (contact.friction)
         """
-        self.at = q, projected
+        # The old Hessian goes before the new one comes
+        self.at, self.elastic = (q, projected), None
         with HESSIAN:
             self.elastic = self.elasticity.hessian_at(q, projected)
             if self.contact:

@@ -52,6 +52,8 @@ class ProjectedHessian:
         contact : (owned, 9) or (0, 9) [N/m] diagonal blocks of contact
         joined  : contact of the surface that couples nodes
         """
+        # The old Hessian goes before the new one comes
+        self.elastic = None
         self.elastic = self.elasticity.hessian_at(q, projected=True, dtype=np.float32)
         self.q, self.joined = q, joined
         self.take_contact(contact)

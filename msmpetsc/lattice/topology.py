@@ -164,8 +164,8 @@ def _neighbours(
     numbers : (l,) global node numbers
     further : number of further rows for nodes with several neighbours in a direction
 
-    Returns the tables of ``find_slot``, the number of cells that share each neighbour, the number
-    of springs of the rank, and the number of springs that it owns.
+    Returns the tables of ``find_slot`` and the number of cells that share each neighbour. The last
+    two numbers are those of the rank's springs, and of the springs that it owns.
     """
     neighbour, following = slots(owned, further)
     sharing = np.zeros((owned + further, 27), np.uint8)

@@ -7,9 +7,9 @@ The hierarchy uses the projected Hessian H, which is positive definite at any po
 CG with the true Hessian has a positive definite preconditioner. The finest level applies H spring
 by spring or cell by cell in single precision, with a block diagonal D in its smoother. The first
 coarse matrix is summed in the same way (solve.multigrid.galerkin). PETSc computes the coarser
-matrices as products P^T H P. P is the same for x, y and z, so PETSc multiplies the nine entries of
-the blocks one after the other, each as a matrix of the nodes. All levels but the coarsest multiply
-in single precision (solve.multigrid.coarse_products).
+matrices as products P^T H P. P is the same for x, y and z. So PETSc multiplies the nine entries of
+the blocks one after the other, as matrices of the nodes. All levels but the coarsest multiply in
+single precision (solve.multigrid.coarse_products).
 """
 
 from collections.abc import Iterator

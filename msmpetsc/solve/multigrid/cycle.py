@@ -240,8 +240,8 @@ class Multigrid:
     def _finest_bound(self) -> float:
         """Return a bound on the eigenvalues of D^-1 H of the finest level, or an estimate by CG.
 
-        The estimate leaves out blocks of contact. They are a part of D and of H and raise no
-        eigenvalue above the bound, but might hide a greater eigenvalue of nodes that later let go.
+        The estimate leaves out blocks of contact. As a part of D and of H they raise no eigenvalue
+        above the bound. But they might hide a greater eigenvalue of nodes that later let go.
         """
         bound, unknowns, contact = self.fine.elasticity.bound, self.unknowns, self.fine.contact
         if bound is not None:

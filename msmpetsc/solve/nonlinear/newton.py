@@ -101,9 +101,6 @@ class Newton(StepMethod):
         """Return the iterate that the loop ends at, and its outcome (StepMethod.minimise)."""
         self._given = start, outcome
         self.snes.solve(None, self.end)
-        # Its work vectors would lie idle while the end is examined
-        self.ksp.reset()
-        self.ksp.setOperators(self.jacobian.operator)
         iterate, outcome = self._given
         return iterate, outcome if self.overshot else self.finish(iterate, outcome)
 

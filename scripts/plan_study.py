@@ -22,7 +22,7 @@ import lab
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.time import STATIC
 from msmpetsc.study.metrics import surface_error
-from msmpetsc.study.sizing.choice import Method, overrides, tables
+from msmpetsc.study.sizing.choice import PlannedMethod, overrides, tables
 
 ERRORS = (0.1, 0.03, 0.01)
 # time limit of a finer run [s]
@@ -64,12 +64,12 @@ class Planned(NamedTuple):
 
     file: Path
     frames: int | None
-    method: Method
+    method: PlannedMethod
     cells: int
     answer: dict
     seconds: float
 
-    def run(self, method: Method, cells: int, limit: float) -> lab.Run:
+    def run(self, method: PlannedMethod, cells: int, limit: float) -> lab.Run:
         """Run the scene with a method and cells, with the surface at the scene's own frames."""
         step = load_scene(self.file).time.step
         changes = overrides(
@@ -81,7 +81,7 @@ class Planned(NamedTuple):
         path = FOLDER / f"{self.file.stem}_{cells}_{method.integrator}.h5"
         return lab.run(self.file, path, ["--quiet"], changes, timeout=limit)
 
-    def finer(self) -> Iterator[tuple[int, Method]]:
+    def finer(self) -> Iterator[tuple[int, PlannedMethod]]:
         """Yield cells and methods of finer runs, the finest first."""
         method = self.method
         finest = max(each["cells"] for each in self.answer["tried"])
@@ -114,7 +114,12 @@ def planned(file: Path, target: float, frames: int | None, cells: int) -> Planne
     answer = json.loads("{" + log.read_text().rpartition("\n{\n")[2])
     choice = answer["choice"]
     return Planned(
-        file, frames, Method(**choice["method"]), choice["cells"], answer, perf_counter() - begin
+        file,
+        frames,
+        PlannedMethod(**choice["method"]),
+        choice["cells"],
+        answer,
+        perf_counter() - begin,
     )
 
 

@@ -30,7 +30,7 @@ from msmpetsc.results.xdmf import write_xdmf
 from msmpetsc.study.charts.plot import COUNT, Chart, curve_styles, log_axis, save_png
 from msmpetsc.study.report import write_report
 from msmpetsc.study.runner import run_study
-from msmpetsc.study.sizing.choice import Method, put_into, tables
+from msmpetsc.study.sizing.choice import PlannedMethod, put_into, tables
 from msmpetsc.study.table import write_table
 from msmpetsc.view.composition import Style
 from msmpetsc.view.drawable import drawable_of_result
@@ -106,7 +106,7 @@ def writers(sources: Path) -> dict[str, Writer]:
         ),
         "planned.toml": Writer(
             "study/sizing/choice.py",
-            lambda path: put_into(path, tables(Method("verlet"))),
+            lambda path: put_into(path, tables(PlannedMethod("verlet"))),
             lambda path: path.write_text("[time] # mine\nstep = 0.1\nduration = 1.0\n"),
         ),
         "table.csv": Writer("study/table.py", lambda path: write_table(path.parent, [])),

@@ -25,7 +25,7 @@ from msmpetsc.study.sizing import trials
 from msmpetsc.study.sizing.choice import (
     Budget,
     Choice,
-    Method,
+    PlannedMethod,
     SizePlan,
     overrides,
     put_into,
@@ -118,7 +118,7 @@ class Bodies:
     def result_of(self, case: Case) -> Path:
         return Path(case.id)
 
-    def error_of(self, method: Method, cells: int) -> float:
+    def error_of(self, method: PlannedMethod, cells: int) -> float:
         time = method.time_error or (1e-3 if method.integrator == "verlet" else 0.0)
         stuck = 0.3 * (len(self.errors) % 2) if self.impacts else 0.0
         of_cells = min(self.most, self.cell_error * cells**-0.5)
@@ -135,7 +135,7 @@ class Bodies:
             return {"status": "timeout", "reason": "took longer than 1 s"}
         if self.fails(integrator, cells):
             return {"status": "failed", "reason": "planted"}
-        method = Method(integrator, time.get("error"), solver.get("error"))
+        method = PlannedMethod(integrator, time.get("error"), solver.get("error"))
         self.errors[self.result_of(case)] = self.error_of(method, cells)
         cost = 1e-6 * cells * (1 if explicit else 3) / case.time_step
         row = {"status": "ok", "reason": "", "cells": float(cells), "time_second": cost}
@@ -280,7 +280,7 @@ def test_orders_that_differ_are_assumed_to_be_their_mean(tmp_path: Path, monkeyp
     errors = {100: 0.2, 800: 0.1, 6400: 0.05, 18102: 0.043}
     (tmp_path / "scene.toml").write_text(SCENE)
 
-    def by_cells(bench: Bodies, method: Method, cells: int) -> float:
+    def by_cells(bench: Bodies, method: PlannedMethod, cells: int) -> float:
         return errors.get(cells, 0.043)
 
     monkeypatch.setattr(Bodies, "error_of", by_cells)
@@ -422,7 +422,7 @@ def test_the_true_error_of_a_plan_of_statics_is_what_was_asked_for(soft_beam: Pa
 
 
 PLAN = SizePlan(
-    Choice(Method("bdf2", 0.005, 1e-2), 4321, Budget(0.05, 0.031), 7.5),
+    Choice(PlannedMethod("bdf2", 0.005, 1e-2), 4321, Budget(0.05, 0.031), 7.5),
     met=True, bounds=["the step: planted"],
 )  # fmt: skip
 
@@ -462,11 +462,11 @@ max_iterations = 5
 def test_what_is_written_into_a_scene_keeps_its_comments(tmp_path: Path):
     path = tmp_path / "scene.toml"
     path.write_bytes(COMMENTED.replace("\n", "\r\n").encode())
-    put_into(path, tables(Method("implicit-euler", 0.005, 1e-2)))
+    put_into(path, tables(PlannedMethod("implicit-euler", 0.005, 1e-2)))
     expected = COMMENTED.replace("= 1.0\n", "= 1.0\nerror = 0.005\n").replace("anderson", "newton")
     expected = expected.replace("max_iterations = 5", "error = 0.01").replace("\n", "\r\n")
     assert path.read_bytes().decode() == expected
-    put_into(path, tables(Method("verlet")))
+    put_into(path, tables(PlannedMethod("verlet")))
     assert 'integrator = "verlet"' in path.read_text() and "# how" in path.read_text()
 
 
@@ -481,11 +481,13 @@ BEFORE = {
 
 @pytest.mark.parametrize(
     "method",
-    [Method("verlet"), Method("implicit-euler", 0.005, 1e-5)],
+    [PlannedMethod("verlet"), PlannedMethod("implicit-euler", 0.005, 1e-5)],
     ids=["explicit", "implicit"],
 )
 @pytest.mark.parametrize("given", BEFORE)
-def test_the_command_of_a_plan_says_what_its_lines_say(tmp_path: Path, given: str, method: Method):
+def test_the_command_of_a_plan_says_what_its_lines_say(
+    tmp_path: Path, given: str, method: PlannedMethod
+):
     """Run with these changes the scene is the same as with the answer written into it."""
     mesh = (
         'mesh.source = "beam.obj"\ncages.count = 10\n'

@@ -17,7 +17,7 @@ PRESET = "newton"
 
 
 @dataclass(frozen=True)
-class Method:
+class PlannedMethod:
     """An integrator with the target errors of its motion and of its steps; None for no target."""
 
     integrator: IntegratorName
@@ -42,7 +42,7 @@ class Budget:
 class Choice:
     """A run with its expected error and cost: computing time per simulated time [s/s]."""
 
-    method: Method
+    method: PlannedMethod
     cells: int
     budget: Budget
     cost: float
@@ -57,7 +57,7 @@ class SizeTrial:
     inverted : number of cells that are inverted at the end
     """
 
-    method: Method
+    method: PlannedMethod
     asked: int
     cells: float
     cost: float
@@ -106,7 +106,7 @@ def inverted_bound(trials: Sequence[SizeTrial], law: str) -> list[str]:
 Tables = Mapping[str, Mapping[str, Any]]
 
 
-def tables(method: Method) -> Tables:
+def tables(method: PlannedMethod) -> Tables:
     """Return the tables of a scene that a method determines; None stands for no key."""
     # the default is left out
     name = None if method.integrator == "implicit-euler" else method.integrator

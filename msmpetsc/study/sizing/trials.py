@@ -17,7 +17,7 @@ from msmpetsc.study.runner import Bench
 from msmpetsc.study.sizing.choice import (
     Budget,
     Choice,
-    Method,
+    PlannedMethod,
     SizePlan,
     SizeTrial,
     inverted_bound,
@@ -140,7 +140,7 @@ class Sizer:
 
     # ---- integrator
 
-    def _chosen_method(self, cells: int) -> tuple[Method, float]:
+    def _chosen_method(self, cells: int) -> tuple[PlannedMethod, float]:
         """Return the cheapest method and the error of its time steps [-].
 
         Verlet, in steps of its stability limit, counts if it is near an implicit run, whose steps
@@ -149,16 +149,16 @@ class Sizer:
         """
         if self.is_static:
             # static states have no error of a time step
-            return Method(STATIC, step_error=self.solved), 0.0
+            return PlannedMethod(STATIC, step_error=self.solved), 0.0
         allowed = self.target / STEP_MARGIN
-        methods = (Method(name, allowed, self.solved) for name in ("bdf2", "implicit-euler"))
+        methods = (PlannedMethod(name, allowed, self.solved) for name in ("bdf2", "implicit-euler"))
         implicit = next(filter(None, (self._run(method, cells) for method in methods)), None)
         if implicit is None:
             raise InputError(
                 f"{self.scene}: the trials failed on {cells} cells, see above: "
                 "nothing can be compared"
             )
-        explicit = self._run(Method("verlet"), cells) if self.explicit else None
+        explicit = self._run(PlannedMethod("verlet"), cells) if self.explicit else None
         if explicit is not None:
             distance = _distance(explicit, implicit)
             if distance > 2 * allowed:
@@ -173,7 +173,7 @@ class Sizer:
 
     # ---- cells
 
-    def _lattices(self, method: Method) -> list[SizeTrial]:
+    def _lattices(self, method: PlannedMethod) -> list[SizeTrial]:
         """Return runs on three lattices, or on two if the coarsest lattices fail.
 
         A coarse lattice fails, for example, if no node lies in a pin. Raises InputError if fewer
@@ -236,7 +236,7 @@ class Sizer:
         return max(1, round(cells))
 
     def _refine_choice(
-        self, method: Method, time_error: float, law: ErrorLaw, lattices: Sequence[SizeTrial]
+        self, method: PlannedMethod, time_error: float, law: ErrorLaw, lattices: Sequence[SizeTrial]
     ) -> SizePlan:
         """Choose, run and measure until the error is a little less than the target.
 
@@ -316,7 +316,7 @@ class Sizer:
 
     # ---- runs
 
-    def _run(self, method: Method, cells: int) -> SizeTrial | None:
+    def _run(self, method: PlannedMethod, cells: int) -> SizeTrial | None:
         """Return a trial, run on first use; report a failure and return None."""
         done = next(
             (each for each in self.trials if (each.method, each.asked) == (method, cells)), None
@@ -335,7 +335,7 @@ class Sizer:
         self.report(trial)
         return trial
 
-    def case(self, method: Method, cells: int) -> Case:
+    def case(self, method: PlannedMethod, cells: int) -> Case:
         """Return the case of a method and a number of cells, with output at the scene's frames."""
         own = tables(method)
         changes = {

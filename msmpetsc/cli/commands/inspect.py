@@ -46,7 +46,7 @@ PROGRAM = 0.29e9
 # peak memory over the arrays of a rank [-]; measured in runs with the preset newton
 FACTOR = 2.1
 # memory of the lattice for a cell, a node (ghosts included) and a spring [byte]
-BYTES = np.array([145, 43, 24])
+BYTES = np.array([113, 43, 24])
 # peak memory for a surface point with 64 weights while W is made [byte]; measured with
 # the embedding "affine"
 BYTES_OF_POINT = 14 * 64 * 8

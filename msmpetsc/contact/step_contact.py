@@ -60,12 +60,6 @@ class StepContact:
         """Return the contact at q."""
         return StepContactAt(self, q, [state.pressed(q[: self.owned]) for state in self.states])
 
-    @property
-    def has_friction(self) -> bool:
-        """Whether friction acts in the step."""
-        of_nodes = any(state.friction is not None for state in self.states)
-        return of_nodes or (self.surface is not None and self.surface.has_friction)
-
     def friction_limits(self, q: Positions) -> Floats:
         """Return the sum of mu N [N] that this rank's friction uses, and its value at q, (2,)."""
         of_nodes = sum(

@@ -71,7 +71,7 @@ class Level:
     pattern: PETSc.Mat
     matrix: PETSc.Mat
 
-    @property
+    @cached_property
     def diagonal(self) -> Indices:
         """Places (n,) of the diagonal blocks in the level's matrix."""
         begin, columns, _ = self.pattern.getValuesCSR()
@@ -247,7 +247,8 @@ class Multigrid:
         if bound is not None:
             return bound
         noise = uniform(unknowns.numbers[to_host(unknowns.free)]).T.ravel()
-        follows = self.fine.joined is None
+        # Surface contact waits for the next hierarchy
+        follows = self.fine.joined is None and len(contact) > 0
         if follows:
             self.fine.take_contact(contact[:0])
         bound = SAFETY * largest_eigenvalue(self.operator, noise, DiagonalBlocks(self.fine))

@@ -67,6 +67,7 @@ class ErrorEstimate:
         pc = self.ksp.getPC()
         pc.setType(PETSc.PC.Type.PYTHON)
         pc.setPythonContext(preconditioner)
+        self.ksp.setOperators(self.operator, self.operator)
         self.ksp.setConvergenceTest(self._converged)
 
     def __call__(self, iterate: Iterate, acceptable: float = 0.0) -> float:
@@ -80,13 +81,9 @@ class ErrorEstimate:
         before = self.hessian.products + self.preconditioner.products
         with ESTIMATE:
             self.linearise(iterate.q, iterate.contact)
-            self.ksp.setOperators(self.operator)
             self.ksp.solve(iterate.f, self.correction)
-            is_found = self.ksp.reason > 0
-            # Work vectors would lie idle until the next estimate
-            self.ksp.reset()
         self.products += self.hessian.products + self.preconditioner.products - before
-        return self.correction_norm + self.missing if is_found else np.inf
+        return self.correction_norm + self.missing if self.ksp.reason > 0 else np.inf
 
     def linearise(self, q: Positions, contact: StepContactAt | None) -> None:
         """Linearise the Hessian and the preconditioner at positions q (l, 3) [m]."""

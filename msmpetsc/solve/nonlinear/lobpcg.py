@@ -4,7 +4,7 @@ The method is Algorithm 5.1 of Knyazev 2001, Toward the optimal preconditioned e
 step's preconditioner. A block is needed since a single direction may settle on a higher mode.
 """
 
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -120,21 +120,19 @@ class Lobpcg:
         least    : fewest iterations
         left_out : directions (r, n), orthonormal in M, that the search leaves out
         """
-        lowest, iterates = [], self.iterates(start, block, left_out)
-        for its, ritz in enumerate(iterates):
+        lowest = []
+        for its, ritz in enumerate(self.iterates(start, block, left_out)):
             lowest.append(ritz[0][0])
             if its == most:
                 break
             least_its, settled = (2, 1 / SETTLED) if lowest[-1] < 0 else (max(least, 1), SETTLED)
             if its >= least_its and lowest[-1] > settled * lowest[its // 2]:
                 break
-        # The products go before the copy comes
-        iterates.close()
         return ritz[0], ritz[1].copy()
 
     def iterates(
         self, start: list[Rows], block: int, left_out: Rows | None = None
-    ) -> Generator[tuple[Floats, Rows, Floats]]:
+    ) -> Iterator[tuple[Floats, Rows, Floats]]:
         """Yield the lowest eigenvalues (k,), their modes (k, n) and errors (k,), without end.
 
         The errors r^T P^-1 r, with residuals r and the preconditioner P, belong to the eigenvalues

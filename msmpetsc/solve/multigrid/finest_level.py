@@ -5,12 +5,13 @@ from typing import NamedTuple
 import numpy as np
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, Rows
+from msmpetsc.backend.arrays import Array, Indices, Mask, Positions, Rows
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.contact.surface.surface_contact import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity, Hessian
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.contact import ContactSmoother
+from msmpetsc.solve.multigrid.galerkin import DIAGONAL, UPPER
 from msmpetsc.solve.petsc.events import FINE
 
 
@@ -20,7 +21,7 @@ class ProjectedHessian:
     H belongs to the positions of the last ``update`` and is positive definite.
 
     products   : number of products so far
-    q          : positions (l, 3) [m] of H
+    diagonal   : (m, 6) upper triangles of D without contact [kg]
     inverse    : (m, 9) D^-1 [1/kg], zero in fixed components
     moves      : (m, 3) bool, the components that are not fixed
     compliance : (owned,) [m/N] estimated compliance of a node at rest
@@ -33,9 +34,9 @@ class ProjectedHessian:
         self.v = np.zeros_like(lattice.nodes, dtype=np.float32)
         self.product = np.empty_like(self.v)
         self.elastic: Hessian | None = None
-        self.q = lattice.nodes
         self.products = 0
         self.contact = np.empty((0, 9), like=lattice.nodes)
+        self.diagonal = np.empty((0, 6), like=lattice.nodes)
         self.inverse = np.empty((unknowns.size, 9), np.float32, like=lattice.nodes)
         self.moves = ~lattice.fixed[unknowns.free]
         blocks = np.zeros((len(lattice.nodes), 9), like=lattice.nodes)
@@ -55,7 +56,12 @@ class ProjectedHessian:
         # The old Hessian goes before the new one comes
         self.elastic = None
         self.elastic = self.elasticity.hessian_at(q, projected=True, dtype=np.float32)
-        self.q, self.joined = q, joined
+        self.joined = joined
+        blocks = np.zeros((len(q), 9), like=q)
+        self.elasticity.add_bound(q, blocks)
+        free = self.unknowns.free
+        self.diagonal = self.t2 * blocks[free][:, UPPER]
+        self.diagonal[:, DIAGONAL] += self.unknowns.ballast[free][:, None]
         self.take_contact(contact)
         self.smoother = (
             ContactSmoother(self.unknowns, joined, self.t2, self.inverse) if joined else None
@@ -63,11 +69,9 @@ class ProjectedHessian:
 
     def take_contact(self, contact: Rows) -> None:
         """Replace the diagonal blocks of contact, (owned, 9) or (0, 9) [N/m]."""
-        self.contact = contact
-        unknowns, blocks = self.unknowns, np.zeros((len(self.q), 9), like=self.q)
-        self.elasticity.add_bound(self.q, blocks)
-        nodes = FreeNodes(unknowns.free, self.moves, unknowns.ballast, contact, self.t2)
-        invert_blocks(unknowns.size, self.inverse, blocks, nodes)
+        self.contact, unknowns = contact, self.unknowns
+        nodes = FreeNodes(unknowns.free, self.moves, contact, self.t2)
+        invert_blocks(unknowns.size, self.inverse, self.diagonal, nodes)
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Write H x to y."""
@@ -124,38 +128,36 @@ def apply_blocks(first: int, count: int, step: int, x: Rows, inverse: Array, y: 
 
 
 class FreeNodes(NamedTuple):
-    """Terms of the diagonal blocks of H.
+    """Free nodes and their contact.
 
     free    : (m,) numbers of the free nodes
     moves   : (m, 3) bool, the components that are not fixed
-    mass    : (owned,) [kg]
     contact : (owned, 9) or (0, 9) [N/m] diagonal blocks of contact
     t2      : t^2 [s^2]
     """
 
     free: Indices
     moves: Mask
-    mass: Floats
     contact: Rows
     t2: float
 
 
 @kernel
 def invert_blocks(
-    first: int, count: int, step: int, inverse: Array, blocks: Rows, nodes: FreeNodes
+    first: int, count: int, step: int, inverse: Array, diagonal: Rows, nodes: FreeNodes
 ) -> None:
-    """Invert the diagonal blocks m I + t^2 (blocks + contact) of components that are not fixed."""
-    free, moves, mass, contact, t2 = nodes
+    """Invert the blocks D + t^2 contact of components that are not fixed.
+
+    diagonal : (m, 6) upper triangles of D [kg]
+    """
+    free, moves, contact, t2 = nodes
     for i in range(first, count, step):
-        node = free[i]
-        m, d = mass[node], blocks[node]
-        a, b, c = t2 * d[0], t2 * d[1], t2 * d[2]
-        e, f, g = t2 * d[4], t2 * d[5], t2 * d[8]
+        a, b, c = diagonal[i, 0], diagonal[i, 1], diagonal[i, 2]
+        e, f, g = diagonal[i, 3], diagonal[i, 4], diagonal[i, 5]
         if len(contact):
-            p = contact[node]
+            p = contact[free[i]]
             a, b, c = a + t2 * p[0], b + t2 * p[1], c + t2 * p[2]
             e, f, g = e + t2 * p[4], f + t2 * p[5], g + t2 * p[8]
-        a, e, g = a + m, e + m, g + m
         x, y, z = moves[i]
         b, c, f = x * y * b, x * z * c, y * z * f
         u, v, w = e * g - f * f, c * f - b * g, b * f - c * e

@@ -58,13 +58,8 @@ LATTICE_MULTIGRID = {
     "mg_levels_ksp_max_it": "1",
     "mg_coarse_ksp_type": "preonly",
     "mg_coarse_pc_type": "redundant",
-    "mg_coarse_redundant_pc_type": "cholesky",
-    # PETSc's factor runs on the CPU, which is faster than cuSPARSE for small matrices.
-    "mg_coarse_redundant_pc_factor_mat_solver_type": "petsc",
-    # Every PETSc has qmd, and it fills least of the common orderings.
-    "mg_coarse_redundant_pc_factor_mat_ordering_type": "qmd",
-    # PETSc's own bound is absolute, but a light body has small pivots.
-    "mg_coarse_redundant_pc_factor_zeropivot": "1e-300",
+    "mg_coarse_redundant_pc_type": "python",
+    "mg_coarse_redundant_pc_python_type": "msmpetsc.solve.multigrid.block_cholesky.BlockCholesky",
 }
 # without pc_type, which nonlinear.jacobian chooses
 NEWTON = {

@@ -7,7 +7,6 @@ move together. Diagonal blocks represent neither, because they fix each node to 
 from itertools import zip_longest
 
 import numpy as np
-from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dpstrf
@@ -16,9 +15,6 @@ from scipy.sparse import csr_array, eye_array, kron
 from msmpetsc.backend.arrays import Array, Rows
 from msmpetsc.contact.surface.surface_contact import SurfaceHessian
 from msmpetsc.solve.linear.unknowns import Unknowns
-
-# most contact nonzeros kept, over those in use; the factor must stay sparse
-SPARE = 2.0
 
 
 class ContactSmoother:
@@ -79,21 +75,17 @@ class CoarseContact:
     """Add contact C = t^2 (W P)^T H_c (W P) to coarse levels. All methods are collective.
 
     The coarsest matrix has the whole of C. The levels between have its diagonal blocks only, so
-    that their nonzeros do not change. The coarsest matrix keeps the nonzeros of earlier contact if
-    they are few. With unchanged nonzeros, PETSc skips the symbolic factorisation, which takes
-    longer than the numeric factorisation.
+    that their nonzeros do not change.
 
     interpolations : P from each coarse level to the next finer level
     scalar         : P of a single coordinate, this rank's rows; empty before the first contact
     coarsest       : coarsest matrix with contact; None before the first contact
-    nonzeros       : pattern of this rank's contact in the coarsest matrix
     """
 
     def __init__(self, unknowns: Unknowns, interpolations: list[PETSc.Mat], t2: float):
         self.unknowns, self.interpolations, self.t2 = unknowns, interpolations, t2
         self.scalar: list[csr_array] = []
         self.coarsest: PETSc.Mat | None = None
-        self.nonzeros = csr_array((0, 0))
 
     def added(
         self, coarsest: PETSc.Mat, blocks: list[Rows], surface: SurfaceHessian | None
@@ -118,37 +110,12 @@ class CoarseContact:
         joined = kron(weights, eye_array(3), "csr").T @ (
             surface.points @ kron(whole, eye_array(3), "csr")
         )
-        return self._coarsest(coarsest, csr_array(joined))
-
-    def _coarsest(self, without: PETSc.Mat, contact: csr_array) -> PETSc.Mat:
-        """Return the coarsest matrix plus t^2 times contact.
-
-        without : coarsest matrix without contact
-        contact : this rank's rows of (W P)^T H_c (W P) [N/m]
-        """
-        here = csr_array(
-            (np.ones_like(contact.data), contact.indices, contact.indptr), contact.shape
-        )
-        room = self.nonzeros + here if self.coarsest else here
-        if self.coarsest is None or without.comm.tompi4py().allreduce(
-            room.nnz > self.nonzeros.nnz, MPI.LOR
-        ):
-            self.destroy()
-            self.nonzeros = room if room.nnz < SPARE * here.nnz else here
-            self.coarsest = without.copy()
-            self._add(
-                aij(0.0 * self.nonzeros, without), PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
-            )
-        self.coarsest.zeroEntries()
-        self.coarsest.axpy(1.0, without, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
-        self._add(aij(self.t2 * contact, without), PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
-        return self.coarsest
-
-    def _add(self, contact: PETSc.Mat, nonzeros: PETSc.Mat.Structure) -> None:
-        """Add a matrix to the coarsest matrix, and destroy it."""
-        assert self.coarsest is not None
-        self.coarsest.axpy(1.0, contact, nonzeros)
+        contact = aij(self.t2 * csr_array(joined), coarsest)
+        self.destroy()
+        self.coarsest = coarsest.copy()
+        self.coarsest.axpy(1.0, contact, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
         contact.destroy()
+        return self.coarsest
 
     def _scalar(self) -> list[csr_array]:
         """Return P of a single coordinate for each coarse level, this rank's rows."""

@@ -1,0 +1,56 @@
+"""Cholesky factor in 3 x 3 blocks, for the coarsest level of multigrid."""
+
+import numpy as np
+from petsc4py import PETSc
+from scipy.sparse import bsr_array, csr_array
+
+# PETSc's own bound of a pivot is absolute, but a light body has small pivots.
+LEAST_PIVOT = 1e-300
+
+
+class BlockCholesky:
+    """Solve with a matrix of 3 x 3 blocks by its Cholesky factor (a context of PCPYTHON).
+
+    Blocks take 0.4 of the time of PETSc's factor of an AIJ, whose analysis takes longer than its
+    numbers. PETSc keeps the order of the blocks, so ``order`` (n,) numbers the nodes for little
+    fill. Every PETSc has qmd, and it fills least of the common orderings.
+    """
+
+    def __init__(self) -> None:
+        self.factor, self.matrix, self.x, self.y = PETSc.PC(), PETSc.Mat(), PETSc.Vec(), PETSc.Vec()
+        self.order = np.empty(0, PETSc.IntType)
+
+    def setUp(self, pc: PETSc.PC) -> None:
+        self.destroy(pc)
+        begin, columns, values = pc.getOperators()[1].getValuesCSR()
+        blocks = bsr_array(csr_array((values, columns, begin)), blocksize=(3, 3))
+        count, column = len(blocks.indptr) - 1, blocks.indices
+        nodes = csr_array((np.ones(len(column)), column, blocks.indptr), (count, count))
+        csr = nodes.indptr, nodes.indices, nodes.data
+        pattern = PETSc.Mat().createAIJ(nodes.shape, csr=csr, comm=PETSc.COMM_SELF)
+        self.order = pattern.getOrdering("qmd")[0].getIndices()
+        pattern.destroy()
+        rank = np.argsort(self.order)
+        first, second = np.repeat(rank, np.diff(blocks.indptr)), rank[column]
+        upper = np.flatnonzero(first <= second)
+        upper = upper[np.lexsort((second[upper], first[upper]))]
+        begin = np.searchsorted(first[upper], np.arange(count + 1))
+        csr = *(part.astype(PETSc.IntType) for part in (begin, second[upper])), blocks.data[upper]
+        self.matrix.createSBAIJ(3 * count, 3, csr=csr, comm=PETSc.COMM_SELF)
+        self.matrix.setOption(PETSc.Mat.Option.SPD, True)
+        self.factor.create(PETSc.COMM_SELF)
+        self.factor.setType(PETSc.PC.Type.CHOLESKY)
+        self.factor.setFactorPivot(LEAST_PIVOT)
+        self.factor.setFactorOrdering("natural")
+        self.factor.setOperators(self.matrix)
+        self.factor.setUp()
+        self.x, self.y = self.matrix.createVecs()
+
+    def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        self.x.array_w.reshape(-1, 3)[:] = x.array_r.reshape(-1, 3)[self.order]
+        self.factor.apply(self.x, self.y)
+        y.array_w.reshape(-1, 3)[self.order] = self.y.array_r.reshape(-1, 3)
+
+    def destroy(self, _: PETSc.PC) -> None:
+        for owned in (self.factor, self.matrix, self.x, self.y):
+            owned.destroy()

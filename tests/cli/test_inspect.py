@@ -94,7 +94,7 @@ def test_a_lattice_too_large_for_petsc_is_refused(scene: Path, monkeypatch):
     lattice = build_model(SELF, load_scene(scene)).lattice
     nodes, nonzeros = lattice.owned, lattice.owned + 2 * len(lattice.springs)
     monkeypatch.setattr("msmpetsc.solve.linear.unknowns.LARGEST", 3 * nodes - 1)
-    for holder in (Unknowns, Ghosted):
+    for holder in (Unknowns, Ghosted.of):
         with pytest.raises(
             InputError, match=f"{nodes} nodes are more than the {3 * nodes - 1} unknowns"
         ):

@@ -12,7 +12,7 @@ import numpy as np
 from lattices import ORIGIN, block, cages_of
 from mpi4py import MPI
 from petsc4py import PETSc
-from scipy.sparse import bsr_array, csr_array
+from scipy.sparse import bsr_array
 
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.geometry.morton import decode_morton
@@ -243,13 +243,8 @@ class Case:
     def interpolation(self, level: int) -> np.ndarray:
         """P to the ``level``-th coarse grid's finer neighbour; 0 is that from the first coarse grid
         to the nodes."""
-        p = self.gathered(self.multigrid.levels[level].interpolation)
-        if level:
-            return p
-        sizes, rows = np.array(self.comm.allgather(self.unknowns.size)), []
-        for size, begin in zip(sizes, np.cumsum(3 * sizes) - 3 * sizes, strict=True):
-            rows.append(begin + np.arange(size)[:, None] + size * np.arange(3))
-        return p[np.concatenate(rows).ravel()]
+        rows = self.multigrid.levels[level].interpolation.rows().toarray()
+        return np.kron(np.concatenate(self.comm.allgather(rows)), np.eye(3))
 
     def level(self, level: int) -> np.ndarray:
         """The matrix of a coarse level, on every rank."""
@@ -258,14 +253,6 @@ class Case:
         begin, columns, _ = pattern.getValuesCSR()
         shape = 3 * (len(begin) - 1), 3 * pattern.getSize()[1]
         own = bsr_array((blocks.reshape(-1, 3, 3), columns, begin), shape).toarray()
-        return np.concatenate(self.comm.allgather(own))
-
-    def gathered(self, matrix: PETSc.Mat) -> np.ndarray:
-        """A matrix with entries, on every rank."""
-        indptr, indices, data = matrix.getValuesCSR()
-        own = csr_array(
-            (data, indices, indptr), shape=(len(indptr) - 1, matrix.getSize()[1])
-        ).toarray()
         return np.concatenate(self.comm.allgather(own))
 
     def iterations(self, rtol: float, rough: bool) -> int:

@@ -89,7 +89,10 @@ class Verlet(Integrator):
         self.comm, self.lattice, self.environment = comm, environment.lattice, environment
         self.time_step, self.substep = time.step, time.substep or np.inf
         self.elasticity = Elasticity(self.lattice)
-        self.position, self.velocity = Ghosted(comm, self.lattice), Ghosted(comm, self.lattice)
+        self.position, self.velocity = (
+            Ghosted.of(comm, self.lattice),
+            Ghosted.of(comm, self.lattice),
+        )
         self.highest = HighestMode(comm, self.lattice, self.elasticity)
         owned = self.lattice.owned
         self.q, self.v = self.position.values[:owned], self.velocity.values[:owned]

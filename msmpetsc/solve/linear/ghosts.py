@@ -4,6 +4,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from msmpetsc.backend.arrays import Array, Indices
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.linear.unknowns import refuse_unknowns
 from msmpetsc.solve.petsc.device import memory_of
@@ -13,20 +14,33 @@ from msmpetsc.solve.petsc.events import GHOSTS
 class Ghosted:
     """Nodal values (l, 3), first owned nodes, then ghosts, shared with two PETSc vectors."""
 
-    def __init__(self, comm: MPI.Comm, lattice: Lattice):
-        refuse_unknowns(lattice.table.total)
-        self.values, memory = np.zeros_like(lattice.nodes), memory_of(lattice.nodes)
-        numbers = self.values.reshape(-1)
-        self.owned = memory.over(numbers[: 3 * lattice.owned], comm)
-        self.ghosts = memory.over(numbers[3 * lattice.owned :], PETSc.COMM_SELF)
-        index = PETSc.IS().createBlock(3, lattice.ghosts.astype(PETSc.IntType), comm=comm)
+    def __init__(self, comm: MPI.Comm, owned: int, ghosts: Indices, device: Array):
+        """Take the number of owned nodes, the global numbers of ghosts, an array on the device."""
+        self.values = np.zeros((owned + len(ghosts), 3), like=device)
+        numbers, memory = self.values.reshape(-1), memory_of(device)
+        self.owned = memory.over(numbers[: 3 * owned], comm)
+        self.ghosts = memory.over(numbers[3 * owned :], PETSc.COMM_SELF)
+        index = PETSc.IS().createBlock(3, ghosts.astype(PETSc.IntType), comm=comm)
         self.scatter = PETSc.Scatter().create(self.owned, index, self.ghosts, None)
         index.destroy()
+
+    @classmethod
+    def of(cls, comm: MPI.Comm, lattice: Lattice) -> "Ghosted":
+        """Return the values of a lattice's nodes. Raises InputError if PETSc cannot number them."""
+        refuse_unknowns(lattice.table.total)
+        return cls(comm, lattice.owned, lattice.ghosts, lattice.nodes)
 
     def update(self) -> None:
         """Update the ghosts with their owners' values (collective)."""
         with GHOSTS:
             self.scatter.scatter(self.owned, self.ghosts)
+
+    def add_ghosts(self) -> None:
+        """Add the ghosts' values to their owners' values (collective)."""
+        with GHOSTS:
+            self.scatter.scatter(
+                self.ghosts, self.owned, PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE
+            )
 
     def destroy(self) -> None:
         """Destroy all PETSc objects (collective)."""

@@ -31,7 +31,7 @@ class HighestMode:
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice, elasticity: Elasticity):
         self.comm, self.lattice, self.elasticity = comm, lattice, elasticity
-        self.mode, self.per_mass = Ghosted(comm, lattice), 1 / lattice.mass
+        self.mode, self.per_mass = Ghosted.of(comm, lattice), 1 / lattice.mass
         self.fixed, self.squared = lattice.fixed[: lattice.owned], 0.0
 
     def fix(self, fixed: Mask) -> None:

@@ -15,6 +15,7 @@ from scipy.sparse import csr_array, eye_array, kron
 from msmpetsc.backend.arrays import Array, Rows
 from msmpetsc.contact.surface.surface_contact import SurfaceHessian
 from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.multigrid.interpolation import Interpolation
 
 
 class ContactSmoother:
@@ -78,13 +79,11 @@ class CoarseContact:
     that their nonzeros do not change.
 
     interpolations : P from each coarse level to the next finer level
-    scalar         : P of a single coordinate, this rank's rows; empty before the first contact
     coarsest       : coarsest matrix with contact; None before the first contact
     """
 
-    def __init__(self, unknowns: Unknowns, interpolations: list[PETSc.Mat], t2: float):
+    def __init__(self, unknowns: Unknowns, interpolations: list[Interpolation], t2: float):
         self.unknowns, self.interpolations, self.t2 = unknowns, interpolations, t2
-        self.scalar: list[csr_array] = []
         self.coarsest: PETSc.Mat | None = None
 
     def added(
@@ -96,11 +95,10 @@ class CoarseContact:
         """
         if surface is None:
             return coarsest
-        self.scalar = self.scalar or self._scalar()
         weights = surface.weights[:, self.unknowns.free]
-        for p, diagonal in zip_longest(self.scalar, blocks):
+        for p, diagonal in zip_longest(self.interpolations, blocks):
             # The order of the ranks makes the sum reproducible.
-            whole = sum(surface.comm.allgather(weights @ p))
+            whole = sum(surface.comm.allgather(weights @ p.rows()))
             count = coarsest.getLocalSize()[0] // 3 if diagonal is None else len(diagonal)
             first = surface.comm.exscan(count) or 0  # type: ignore[attr-defined]
             weights = csr_array(whole[:, first : first + count])
@@ -116,17 +114,6 @@ class CoarseContact:
         self.coarsest.axpy(1.0, contact, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
         contact.destroy()
         return self.coarsest
-
-    def _scalar(self) -> list[csr_array]:
-        """Return P of a single coordinate for each coarse level, this rank's rows."""
-        scalar: list[csr_array] = []
-        for p in self.interpolations:
-            begin, columns, values = p.getValuesCSR()
-            whole = csr_array((values, columns, begin), shape=(len(begin) - 1, p.getSize()[1]))
-            # Unknowns are ordered by coordinate, coarse rows by node.
-            rows = slice(None, None, 3) if scalar else slice(self.unknowns.size)
-            scalar.append(csr_array(csr_array(whole[rows])[:, ::3]))
-        return scalar
 
     def destroy(self) -> None:
         """Destroy the coarsest matrix with contact (collective)."""

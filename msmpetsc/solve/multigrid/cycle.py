@@ -36,6 +36,7 @@ from msmpetsc.solve.multigrid.finest_level import DiagonalBlocks, ProjectedHessi
 from msmpetsc.solve.multigrid.free_bodies import bodies_of
 from msmpetsc.solve.multigrid.galerkin import GalerkinSum
 from msmpetsc.solve.multigrid.grids import CoarseGrid, grids, interpolation, node_keys
+from msmpetsc.solve.multigrid.interpolation import Interpolation
 from msmpetsc.solve.petsc import device
 from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev
 
@@ -58,7 +59,7 @@ class Level:
     """Coarse level.
 
     grid          : its nodes
-    interpolation : P (AIJ) to the next finer level
+    interpolation : P to the next finer level
     scalar        : P (AIJ) of a single coordinate; None for the first coarse level
     pattern       : AIJ of the nodes, with an entry for each block of the level's matrix
     matrix        : the level's matrix (AIJ of block size 3). If CoarseOperator multiplies in its
@@ -66,7 +67,7 @@ class Level:
     """
 
     grid: CoarseGrid
-    interpolation: PETSc.Mat
+    interpolation: Interpolation
     scalar: PETSc.Mat | None
     pattern: PETSc.Mat
     matrix: PETSc.Mat
@@ -124,7 +125,7 @@ class Multigrid:
     def _create_levels(self, elasticity: Elasticity, t2: float) -> tuple[GalerkinSum, list[Level]]:
         """Return the sum of the first coarse matrix, and the coarse levels without values."""
         unknowns, comm = self.unknowns, self.unknowns.comm
-        size, everywhere = unknowns.size, node_keys(unknowns)
+        everywhere = node_keys(unknowns)
         offsets = self.bodies.offsets(comm, everywhere)
         free = to_host(unknowns.free)
         copies = CoarseCopies(unknowns.lattice, everywhere, offsets)
@@ -141,24 +142,25 @@ class Multigrid:
         galerkin = GalerkinSum(
             unknowns, elasticity, t2, coarse[0], everywhere, offsets, copies.of_nodes, stiff
         )
-        rows = np.arange(size)[:, None] + size * np.arange(3)
-        sizes = 3 * size, 3 * unknowns.total
         levels: list[Level] = []
         for grid in coarse:
-            p = interpolation(comm, keys, rows, sizes, grid, unknowns.memory.mat_type)
+            rows = interpolation(keys, grid)
+            p = Interpolation(comm, rows, grid, unknowns.lattice.nodes, not levels)
             scalar, pattern = None, galerkin.pattern
             if levels:
-                finer = levels[-1].grid.sizes(1)
-                scalar = interpolation(
-                    comm, keys, rows[:, :1] // 3, finer, grid, unknowns.memory.mat_type
-                )
+                finer, coarser = len(keys), len(grid.table.keys)
+                sizes = (finer, levels[-1].grid.table.total), (coarser, grid.table.total)
+                scalar = PETSc.Mat().create(comm)
+                scalar.setSizes(sizes)
+                scalar.setType(unknowns.memory.mat_type)
+                index = (part.astype(PETSc.IntType) for part in (rows.indptr, rows.indices))
+                scalar.setPreallocationCSR((*index, rows.data))
                 self.owned.callback(scalar.destroy)
                 pattern = PETSc.Mat()
             levels.append(Level(grid, p, scalar, pattern, PETSc.Mat()))
-            for owned in (p, pattern, levels[-1].matrix):
+            for owned in (p.operator, pattern, levels[-1].matrix):
                 self.owned.callback(owned.destroy)
-            keys, sizes = grid.table.keys, grid.sizes(3)
-            rows = 3 * np.arange(len(keys))[:, None] + np.arange(3)
+            keys = grid.table.keys
         return galerkin, levels
 
     def update(self, q: Positions, contact: Rows, surface: SurfaceHessian | None = None) -> None:
@@ -313,8 +315,8 @@ class Multigrid:
         pc.setType(PETSc.PC.Type.MG)
         pc.setMGLevels(top + 1)
         for i, level in enumerate(self.levels):
-            pc.setMGInterpolation(top - i, level.interpolation)
-            pc.setMGRestriction(top - i, self._restriction(level.interpolation))
+            pc.setMGInterpolation(top - i, level.interpolation.operator)
+            pc.setMGRestriction(top - i, self._restriction(level.interpolation.operator))
             ksp = pc.getMGSmoother(top - 1 - i) if i < top - 1 else pc.getMGCoarseSolve()
             ksp.setOperators(
                 self.coarse[i].operator if i < len(self.coarse) else level.matrix, level.matrix

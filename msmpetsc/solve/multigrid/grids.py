@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
+from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import Array, Indices, Mask
 from msmpetsc.geometry.grid import CORNERS
@@ -32,10 +32,6 @@ class CoarseGrid:
 
     table: SortedKeys
     copies: Array
-
-    def sizes(self, width: int) -> tuple[int, int]:
-        """Return the numbers of unknowns of this rank and of all ranks, ``width`` for each node."""
-        return width * len(self.table.keys), width * self.table.total
 
 
 def node_keys(unknowns: Unknowns) -> Indices:
@@ -88,39 +84,13 @@ def grids(
     return levels
 
 
-def interpolation(
-    comm: MPI.Comm,
-    keys: Indices,
-    rows: Indices,
-    row_sizes: tuple[int, int],
-    grid: CoarseGrid,
-    mat_type: str,
-) -> PETSc.Mat:
-    """Return the interpolation P (AIJ) from a coarse grid to finer nodes (collective).
+def interpolation(keys: Indices, grid: CoarseGrid) -> csr_array:
+    """Return the interpolation P of a coordinate to finer nodes with keys (n,) (collective).
 
-    keys      : (n,) keys of this rank's finer nodes that are unknowns
-    rows      : (n, w) local rows of their w components, 3 or 1
-    row_sizes : numbers of rows of this rank and of all ranks
+    The rows are those nodes, the columns all coarse nodes.
     """
-    width = rows.shape[1]
     parents, needed = parents_of(keys, grid.copies)
-    number = np.full(parents.shape, -1)
-    number[needed] = grid.table.find(parents[needed])
     count = needed.sum(axis=1)
-    lengths = np.empty(row_sizes[0], np.int64)
-    lengths[rows] = count[:, None]
-    begin = np.concatenate([[0], np.cumsum(lengths)])
-    columns, values = np.empty(begin[-1], PETSc.IntType), np.empty(begin[-1])
-    slot = np.cumsum(needed, axis=1) - 1
-    node, corner = np.nonzero(needed)
-    for c in range(width):
-        entry = begin[rows[node, c]] + slot[node, corner]
-        columns[entry] = width * number[node, corner] + c
-        values[entry] = 1 / count[node]
-    csr = begin.astype(PETSc.IntType), columns, values
-    matrix = PETSc.Mat().create(comm=comm)
-    matrix.setSizes((row_sizes, grid.sizes(width)))
-    matrix.setType(mat_type)
-    matrix.setPreallocationCSR(csr)
-    matrix.setName("interpolation")
-    return matrix
+    begin = np.append(0, np.cumsum(count))
+    columns = grid.table.find(parents[needed])
+    return csr_array((np.repeat(1 / count, count), columns, begin), (len(keys), grid.table.total))

@@ -81,24 +81,28 @@ def test_the_stiff_points_and_the_others_are_the_whole_less_what_joins_both(
     assert surface.split(1e-12 * compliance, POINTS)[0] is None
 
 
-def test_the_coarsest_matrix_has_the_contact_of_now_and_room_for_that_of_before():
-    """It is analysed anew where contact has come to where there was no room for it."""
-    size, rng = 12, np.random.default_rng(7)
-    without = PETSc.Mat().createAIJ((size, size), bsize=3, comm=MPI.COMM_SELF)
+def test_the_coarsest_matrix_has_the_whole_contact_and_finer_levels_their_blocks(
+    surface: SurfaceHessian,
+):
+    """Beside P^T C P by dense matrices, twice: the second contact replaces the first."""
+    rng = np.random.default_rng(7)
+    p = [rng.random((NODES, 6)), rng.random((6, 4))]
+    without = PETSc.Mat().createAIJ((12, 12), bsize=3, comm=MPI.COMM_SELF)
     without.setUp()
     without.setDiagonal(without.createVecRight() + 2.0)
-    coarse = CoarseContact(SimpleNamespace(comm=MPI.COMM_SELF), [], T2)
-    found = []
-    for joined_nodes in ((0, 1, 2), (0, 2), (1, 2), (3,)):
-        rows = (3 * np.array(joined_nodes)[:, None] + np.arange(3)).ravel()
-        contact = np.zeros((size, size))
-        contact[np.ix_(rows, rows)] = 1 + rng.random((len(rows), len(rows)))
-        matrix = coarse._coarsest(without, sparse.csr_array(contact))
-        np.testing.assert_allclose(matrix[:, :], 2 * np.eye(size) + T2 * contact)
-        found.append(matrix.handle)
-    assert found[0] == found[1] == found[2]
-    # the last contact alone; the earlier contact would take ten times as many
-    assert coarse.nonzeros.nnz == 9
+    unknowns = SimpleNamespace(free=np.arange(NODES))
+    rows = [SimpleNamespace(rows=lambda p=p: sparse.csr_array(p)) for p in p]
+    coarse = CoarseContact(unknowns, rows, T2)
+    for _ in range(2):
+        between = np.zeros((6, 9))
+        matrix = coarse.added(without, [between], surface)
+        first, second = (np.kron(whole, np.eye(3)) for whole in (p[0], p[0] @ p[1]))
+        expected = first.T @ joined(surface) @ first
+        blocks = expected.reshape(6, 3, 6, 3)[np.arange(6), :, np.arange(6)].reshape(6, 9)
+        np.testing.assert_allclose(between, blocks, rtol=1e-10)
+        expected = second.T @ joined(surface) @ second + 2 * np.eye(12)
+        np.testing.assert_allclose(matrix[:, :], expected, rtol=1e-10)
+        surface.points.data *= 0.5
     coarse.destroy()
     without.destroy()
 

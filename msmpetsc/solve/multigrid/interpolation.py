@@ -32,7 +32,7 @@ class Interpolation:
 
     parents  : coarse nodes of each finer node, by local numbers
     children : finer nodes of each local coarse node
-    coarse   : values of the coarse nodes, ghosts included
+    coarse   : values of the coarse nodes, ghosts included; None if no rank has ghosts
     is_first : whether finer vectors are ordered by coordinate, as unknowns are, not by node
     """
 
@@ -57,7 +57,8 @@ class Interpolation:
             Lists(*(like(device, part.astype(np.uint32)) for part in (p.indptr, p.indices)))
             for p in (here, csr_array(here.T))
         )
-        self.coarse, self.memory = Ghosted(comm, self.own, self.ghosts, device), memory_of(device)
+        self.memory, any_ghosts = memory_of(device), comm.allreduce(len(self.ghosts)) > 0
+        self.coarse = Ghosted(comm, self.own, self.ghosts, device) if any_ghosts else None
         shape = tuple((3 * size, 3 * comm.allreduce(size)) for size in (rows.shape[0], self.own))
         self.operator = PETSc.Mat().createPython(shape, self, comm=comm)
         self.operator.setVecType(self.memory.vec_type)
@@ -71,17 +72,23 @@ class Interpolation:
         """Write P x + before to y."""
         if before.handle != y.handle:
             before.copy(y)
-        self.coarse.values[: self.own] = self.memory.read(x).reshape(self.own, 3)
-        self.coarse.update()
+        coarse = self.memory.read(x).reshape(self.own, 3)
+        if self.coarse:
+            self.coarse.values[: self.own] = coarse
+            self.coarse.update()
+            coarse = self.coarse.values
         finer = self._by_node(self.memory.write(y))
-        add_means(len(finer), finer, self.coarse.values, self.parents)
+        add_means(len(finer), finer, coarse, self.parents)
 
     def multTranspose(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Write P^T x to y."""
-        coarse, finer = self.coarse.values, self._by_node(self.memory.read(x))
+        own = self.memory.write(y).reshape(self.own, 3)
+        coarse = self.coarse.values if self.coarse else own
+        finer = self._by_node(self.memory.read(x))
         sum_shares(len(coarse), coarse, finer, self.children, self.parents)
-        self.coarse.add_ghosts()
-        self.memory.write(y)[:] = coarse[: self.own].ravel()
+        if self.coarse:
+            self.coarse.add_ghosts()
+            own[:] = coarse[: self.own]
 
     def _by_node(self, values: Floats) -> Rows:
         """Return the values of a finer vector as a view (n, 3)."""
@@ -96,7 +103,8 @@ class Interpolation:
         return csr_array((np.repeat(1 / count, count), numbers, begin), size)
 
     def destroy(self, _: PETSc.Mat) -> None:
-        self.coarse.destroy()
+        if self.coarse:
+            self.coarse.destroy()
 
 
 @kernel

@@ -24,6 +24,7 @@ class ProjectedHessian:
     diagonal   : (m, 6) upper triangles of D without contact [kg]
     inverse    : (m, 9) D^-1 [1/kg], zero in fixed components
     moves      : (m, 3) bool, the components that are not fixed
+    touched    : nodes with contact
     compliance : (owned,) [m/N] estimated compliance of a node at rest
     """
 
@@ -36,6 +37,7 @@ class ProjectedHessian:
         self.elastic: Hessian | None = None
         self.products = 0
         self.contact = np.empty((0, 9), like=lattice.nodes)
+        self.touched = np.flatnonzero(self.contact)
         self.diagonal = np.empty((0, 6), like=lattice.nodes)
         self.inverse = np.empty((unknowns.size, 9), np.float32, like=lattice.nodes)
         self.moves = ~lattice.fixed[unknowns.free]
@@ -70,6 +72,7 @@ class ProjectedHessian:
     def take_contact(self, contact: Rows) -> None:
         """Replace the diagonal blocks of contact, (owned, 9) or (0, 9) [N/m]."""
         self.contact, unknowns = contact, self.unknowns
+        self.touched = np.flatnonzero(contact.any(axis=1))
         nodes = FreeNodes(unknowns.free, self.moves, contact, self.t2)
         invert_blocks(unknowns.size, self.inverse, self.diagonal, nodes)
 
@@ -81,8 +84,8 @@ class ProjectedHessian:
             self.unknowns.to_nodes(x, self.v)
             self.product[:] = 0
             self.elastic.add_product(self.v, self.product)
-            if len(self.contact):
-                add_node_blocks(len(self.contact), self.contact, self.v, self.product)
+            if len(self.touched):
+                add_node_blocks(len(self.touched), self.touched, self.contact, self.v, self.product)
             if self.joined:
                 self.joined.add_product(self.v, self.product)
             self.unknowns.scaled_sum(self.v, self.t2, self.product, y)
@@ -111,9 +114,10 @@ class DiagonalBlocks:
 
 @kernel
 def add_node_blocks(
-    first: int, count: int, step: int, blocks: Rows, v: Array, product: Array
+    first: int, count: int, step: int, nodes: Indices, blocks: Rows, v: Array, product: Array
 ) -> None:
-    for i in range(first, count, step):
+    for at in range(first, count, step):
+        i = nodes[at]
         for r in range(3):
             for c in range(3):
                 product[i, r] += blocks[i, 3 * r + c] * v[i, c]

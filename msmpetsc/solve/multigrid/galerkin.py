@@ -210,7 +210,9 @@ class GalerkinSum:
     ) -> PETSc.Mat:
         """Return the matrix with entries of the pairs; ``upper`` adds transposes (collective)."""
         comm = self.unknowns.comm
-        refuse_nonzeros(comm, 9 * (len(first) + len(upper)))
+        # Only a GPU has a matrix of all unknowns on this level.
+        entries = 1 if on_host(self.unknowns.lattice.nodes) else 9
+        refuse_nonzeros(comm, entries * (len(first) + len(upper)))
         pattern = PETSc.Mat().create(comm=comm)
         pattern.setSizes(2 * ((len(grid.table.keys), grid.table.total),))
         pattern.setType(self.unknowns.memory.mat_type)

@@ -52,7 +52,7 @@ NO_USE = {
     r"(.*_)?pc_type deflation": "PETSc never finds a deflation space; mg can",
     r"mg_\w*ksp_type pipelcg": "it does not end within a cycle; cg can",
     r"(.*_)?mat_ordering_type wbm": "it makes PETSc abort; qmd can",
-    r"(.*_)?(snes|ksp|mg_\w*pc)_python_type .*": "a Python object cannot be used here",
+    r"(.*_)?(snes|ksp|mg_\w*pc)_python_type (?!msmpetsc\.).*": "no Python object can be used here",
     r"(snes_(mf|fd|lag|adapt|grid_sequence)\w*|ksp_reuse_preconditioner) .*": (
         "solver.preset chooses the Jacobian"
     ),

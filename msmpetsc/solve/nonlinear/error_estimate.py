@@ -114,8 +114,8 @@ class ErrorEstimate:
         least   : kappa; 0 for the first bound alone
         """
         self.residual = ksp.buildResidual(self.residual)
-        self.correction_norm = self.functional.norm(ksp.getSolution())
-        self.missing = self.functional.dual_norm(self.residual) / self.lowest
+        self.correction_norm, f = self.functional.norms(ksp.getSolution(), self.residual)
+        self.missing = f / self.lowest
         if least > 0:
             close = natural / float(np.sqrt(self.lowest * least))
             self.missing = min(self.missing, float(np.sqrt(self.missing * close)))

@@ -223,17 +223,26 @@ class StepFunctional:
 
     def norm(self, displacement: PETSc.Vec) -> float:
         """Return |v|_M = sqrt(v^T M v)."""
-        return float(
-            np.sqrt(self.comm.allreduce(float(self.memory.read(displacement) ** 2 @ self.mass)))
-        )
+        return float(np.sqrt(self.comm.allreduce(self._square(displacement))))
 
     def dual_norm(self, f: PETSc.Vec) -> float:
         """Return |f|_(M^-1).
 
         |F|_(M^-1) bounds |x - x*|_M if E is convex: the Hessian of g is then at least M.
         """
-        squares = self.memory.read(f) ** 2 / self.mass
-        return float(np.sqrt(self.comm.allreduce(float(squares.sum()))))
+        return float(np.sqrt(self.comm.allreduce(self._dual_square(f))))
+
+    def norms(self, displacement: PETSc.Vec, f: PETSc.Vec) -> tuple[float, float]:
+        """Return |v|_M and |f|_(M^-1) by a single sum over the ranks."""
+        own = np.array([self._square(displacement), self._dual_square(f)])
+        of_v, of_f = np.sqrt(self.comm.allreduce(own))
+        return float(of_v), float(of_f)
+
+    def _square(self, displacement: PETSc.Vec) -> float:
+        return float(self.memory.read(displacement) ** 2 @ self.mass)
+
+    def _dual_square(self, f: PETSc.Vec) -> float:
+        return float((self.memory.read(f) ** 2 / self.mass).sum())
 
     def pull(self, f: PETSc.Vec) -> tuple[Indices, Floats]:
         """Return the free nodes, by local number, and |F| / m [m] of each."""

@@ -118,21 +118,21 @@ class Translations:
         self.mass = unknowns.lattice.mass[unknowns.free]
         self.of_body = self._sums(self.mass[None])[0]
 
-    def of(self, forces: Rows) -> Rows:
-        """Return T (T^T M T)^-1 T^T f (3, m) of forces f (3, m)."""
+    def means(self, forces: Rows) -> Rows:
+        """Return the columns (3, b + 1) of (T^T M T)^-1 T^T f of forces f (3, m); the last is 0."""
         moved = self.free * self._sums(forces) / self.of_body
-        return like(forces, np.append(moved, np.zeros((3, 1)), axis=1))[:, self.body]
+        return like(forces, np.append(moved, np.zeros((3, 1)), axis=1))
 
     def around(self, cycle: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Apply a cycle with exact translations to x; write the result to y."""
         unknowns = self.unknowns
         forces, rest = unknowns.columns(x), x.duplicate()
-        whole = self.of(forces)
-        unknowns.columns_to_write(rest)[:] = forces - self.mass * whole
+        whole = self.means(forces)
+        unknowns.columns_to_write(rest)[:] = forces - self.mass * whole.take(self.body, axis=1)
         cycle.apply(rest, y)
         rest.destroy()
         moved = unknowns.columns_to_write(y)
-        moved += whole - self.of(self.mass * moved)
+        moved += (whole - self.means(self.mass * moved)).take(self.body, axis=1)
 
     def _sums(self, rows: Rows) -> Floats:
         """Return the sums (r, b) of rows (r, m) over the nodes of each free body."""

@@ -16,8 +16,6 @@ from msmpetsc.lattice.lattice import Lattice
 POISSON = (0.0, 0.25, 0.45, 0.499)
 # displacements and forces (n, 3)
 Fields = tuple[np.ndarray, np.ndarray]
-# torsion constant of a square of side 1 [-]
-SQUARE = 0.140577
 # length of a cantilever of thickness 1 m [m]
 LENGTH = 10
 
@@ -52,19 +50,28 @@ def clamped(lattice: Lattice, force: np.ndarray) -> float:
 # ---- torsion
 
 
-def torsion_error(across: int, poisson: float) -> float:
-    """Return the error of a square bar's torsional stiffness, from two lengths."""
+def torsion_constant(width: float) -> float:
+    """Return the torsion constant [m^4] of a rectangle 1 m thick (Timoshenko and Goodier 1951)."""
+    n = np.arange(1, 100, 2)
+    return (
+        width / 3 * (1 - 192 / (np.pi**5 * width) * (np.tanh(n * np.pi * width / 2) / n**5).sum())
+    )
+
+
+def torsion_error(across: int, poisson: float, width: int = 1) -> float:
+    """Return the error of the torsional stiffness of a bar 1 m thick, from two lengths."""
     compliance = []
-    for length in (3, 6):
-        lattice = box((length * across, across, across), 1 / across, poisson)
+    for length in (3 * width, 6 * width):
+        lattice = box((length * across, width * across, across), 1 / across, poisson)
         x = lattice.nodes
         left, right = np.isclose(x[:, 0], 0), np.isclose(x[:, 0], length)
-        arm = x - [length, 0.5, 0.5]
+        arm = x - [length, width / 2, 0.5]
         u = np.where(right[:, None], np.cross([1, 0, 0], arm), 0.0)
         fixed = np.repeat((left | right)[:, None], 3, axis=1)
         forces = solve(lattice, fixed, u, np.zeros_like(x))[1]
         compliance.append(1 / np.cross(arm, forces)[right].sum(axis=0)[0])
-    return 3 / (compliance[1] - compliance[0]) / (SQUARE * E / (2 * (1 + poisson))) - 1
+    exact = torsion_constant(width) * E / (2 * (1 + poisson))
+    return 3 * width / (compliance[1] - compliance[0]) / exact - 1
 
 
 # ---- plates

@@ -1,11 +1,17 @@
-"""A ball pressed by a rigid plate, by quadratic finite elements of the section.
+"""A ball pressed by a rigid plate: lattices, and quadratic finite elements of the section.
 
-Run as a script it prints the force for `scripts/results/contact.md`.
+Run as a script it prints the forces for `scripts/results/contact.md`.
 """
+
+from typing import Any
+
+import lab
 
 import numpy as np
 import skfem
+import trimesh
 from scipy.sparse.linalg import spsolve
+from solid_runs import held, run
 
 # Young's modulus [Pa], Poisson's ratio, Lame's parameters [Pa]; the radius is 1 m
 E, NU = 1e6, 0.3
@@ -13,6 +19,10 @@ MU, LAMBDA = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))
 # the change of a Newton iteration that ends it [m]
 # the most iterations and changes of the contact
 SMALL, MOST = 1e-9, 60
+# how far the plate is pressed in, and the gap before a barrier's plate [m]
+DEPTH, GAP = 0.02, 0.005
+# the force [N] of the section's finite elements at DEPTH
+ELEMENTS = 4387.0
 
 
 def hertz(depth: float) -> float:
@@ -120,7 +130,80 @@ def force(depth: float, edge: float, loads: int = 2) -> float:
     return float(push[held].sum())
 
 
+def octant(edge: float) -> trimesh.Trimesh:
+    """Return an octant of the ball with edges [m] of ``edge`` within 0.22 m of (0, 0, 1)."""
+    angle, size = 0.0, edge
+    points = [np.eye(3)[2:]]
+    while angle < np.pi / 2:
+        size = edge if angle < 0.22 else min(1.2 * size, 0.1)
+        angle += 0.87 * size
+        if angle > np.pi / 2 - size / 2:
+            angle = np.pi / 2
+        around = np.linspace(0, np.pi / 2, max(2, round(np.sin(angle) * np.pi / 2 / size) + 1))
+        ring = np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around)
+        points.append(np.column_stack([*ring, np.full(len(around), np.cos(angle))]))
+    every = np.concatenate([*points, np.zeros((1, 3))])
+    every[np.abs(every) < 1e-12] = 0
+    return trimesh.convex.convex_hull(every)
+
+
+def lattice_force(cells: int, mesh: trimesh.Trimesh, response: str, **contact: Any) -> float:
+    """Return the force [N] of a plate on a lattice with ``cells`` cells a radius.
+
+    contact : ``stiffness`` of the penalty, or ``distance`` of the barrier
+    """
+    sides: dict[str, Any] = {
+        "cages": {"cell_size": 1 / cells},
+        "pin": [held(axis, 0, -1) | {"fix": ["xyz"[axis]]} for axis in range(3)],
+        "solver": {"error": 1e-5},
+    }
+    if response == "penalty":
+        path = [{"time": 1, "by": [0, 0, -DEPTH]}]
+        plate = {"shape": "plane", "point": [0, 0, 1], "normal": [0, 0, -1], "path": path}
+        time = {"integrator": "static", "step": 1, "duration": 1}
+        tables = {"obstacle": [plate | {"response": response} | contact], "time": time}
+    else:
+        path = [{"time": 1, "by": [0, 0, -DEPTH - GAP]}]
+        plate = {"shape": "box", "box": [[-0.5, -0.5, 1 + GAP], [1.5, 1.5, 1.5]], "path": path}
+        # light, and led slowly: at the end the ball is at rest
+        tables = {
+            "obstacle": [plate | {"response": response}],
+            "self_contact": contact,
+            "time": {"integrator": "implicit-euler", "step": 0.1, "duration": 1.5},
+            "material": {"density": 1},
+        }
+    push = run(mesh, NU, **sides, **tables).frames[-1].push
+    assert push is not None
+    return 4 * abs(push[0, 2])
+
+
+def row(name: str, value: float) -> None:
+    """Print a force [N] against the finite elements and against Hertz."""
+    errors = value / ELEMENTS - 1, value / hertz(DEPTH) - 1
+    print(f"{name}: {value:.0f} N, {errors[0]:+.1%} of the elements ({errors[1]:+.1%})", flush=True)
+
+
 if __name__ == "__main__":
-    for pressed, size in ((2e-4, 1e-3), (0.02, 0.02), (0.02, 0.01), (0.02, 0.005)):
+    for pressed, size in ((2e-4, 1e-3), (DEPTH, 0.02), (DEPTH, 0.01), (DEPTH, 0.005)):
         ratio = force(pressed, size) / hertz(pressed)
         print(f"pressed in by {pressed} m, edges of {size} m: {100 * (ratio - 1):+.2f}% of Hertz")
+    scene = trimesh.load(lab.SCENES / "studies" / "yardstick" / "ball_octant.obj", process=False)
+    for cells in (8, 16, 32):
+        row(f"penalty, {cells} cells", lattice_force(cells, scene, "penalty"))
+    for cells in (16, 32):
+        stiff = lattice_force(cells, scene, "penalty", stiffness=2e7)
+        row(f"penalty of 2e7 N/m, {cells} cells", stiff)
+    for cells, edge in (
+        (8, 0.05),
+        (16, 0.05),
+        (16, 0.025),
+        (16, 0.0125),
+        (32, 0.025),
+        (32, 0.0125),
+    ):
+        thin = lattice_force(cells, octant(edge), "barrier", distance=2e-4)
+        row(f"barrier, {cells} cells, edges of {edge} m", thin)
+    for cells, edge in ((8, 0.05), (16, 0.025), (32, 0.0125)):
+        for share in (24, 64):
+            wide = lattice_force(cells, octant(edge), "barrier", distance=1 / cells / share)
+            row(f"barrier of 1/{share} of a cell, {cells} cells, edges of {edge} m", wide)

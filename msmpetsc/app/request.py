@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields
 from numbers import Integral
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from msmpetsc.app.checks import (
     MEASURE_NAMES,
@@ -33,28 +33,23 @@ if TYPE_CHECKING:
 File = str | os.PathLike[str]
 
 
-@dataclass(frozen=True)
-class Option:
+class Option(NamedTuple):
     """Help and command line syntax of a field of the request.
 
-    value   : placeholder for the value in the help; "" for a switch
-    kind    : function that converts a word to the value
-    choices : all valid values; None for any value
-    short   : alternative name with a single dash
-    python  : whether only Python has the option, or the command line has another form of it
+    short    : alternative name with a single dash, if any
+    python   : whether only Python has the option, or the command line has another form of it
+    keywords : further keywords of its argument for argparse
     """
 
     help: str
-    value: str = ""
-    kind: Callable[[str], Any] = str
-    choices: tuple[str, ...] | None = None
-    short: str = ""
-    python: bool = False
+    short: tuple[str, ...]
+    python: bool
+    keywords: dict[str, Any]
 
 
-def given(default: Any, option: Option) -> Any:
+def given(default: Any, help: str, /, *short: str, python: bool = False, **keywords: Any) -> Any:
     """Return a dataclass field with its default and its option as metadata."""
-    return field(default=default, metadata={"option": option})
+    return field(default=default, metadata={"option": Option(help, short, python, keywords)})
 
 
 @dataclass(frozen=True)
@@ -63,98 +58,100 @@ class RunRequest:
 
     scene: "File | Mapping[str, Any] | Scene | None" = given(
         None,
-        Option("scene file (TOML); in Python also a Scene or its tables", "SCENE", checked_path),
+        "scene file (TOML); in Python also a Scene or its tables",
+        nargs="?",
+        metavar="SCENE",
+        type=checked_path,
     )
     output: File | None = given(
         None,
-        Option(
-            "result file, .h5 or .hdf5; default: out/SCENE.h5",
-            "OUT.h5",
-            checked_file,
-            short="-o",
-        ),
+        "result file, .h5 or .hdf5; default: out/SCENE.h5",
+        "-o",
+        metavar="OUT.h5",
+        type=checked_file,
     )
     _: KW_ONLY
-    preset: str | None = given(None, Option("solver preset (see --list-presets)", "NAME"))
-    error: float | None = given(None, Option("target relative error of a step", "E", float))
+    preset: str | None = given(None, "solver preset (see --list-presets)", metavar="NAME")
+    error: float | None = given(None, "target relative error of a step", metavar="E", type=float)
     device: Literal["cpu", "cuda"] | None = given(
-        None,
-        Option("device: CPU, or CUDA GPU (-mat_type aijcusparse)", choices=("cpu", "cuda")),
+        None, "device: CPU, or CUDA GPU (-mat_type aijcusparse)", choices=("cpu", "cuda")
     )
-    frames: int | None = given(None, Option("stop after N steps", "N", int))
+    frames: int | None = given(None, "stop after N steps", metavar="N", type=int)
     set: Mapping[str, Any] | Sequence[str] = given(
-        (), Option("override scene keys: cages.count=3000, obstacle.0.friction=0.5", "KEY=VALUE")
+        (),
+        "override scene keys: cages.count=3000, obstacle.0.friction=0.5",
+        metavar="KEY=VALUE",
+        action="append",
+        default=[],
     )
-    picture: bool = given(False, Option("draw a few frames into OUT.png"))
-    overwrite: bool = given(False, Option("replace OUT.h5 if it exists"))
+    picture: bool = given(False, "draw a few frames into OUT.png", action="store_true")
+    overwrite: bool = given(False, "replace OUT.h5 if it exists", action="store_true")
     resume: File | None = given(
         None,
-        Option(
-            "continue the stopped run that wrote this file; with SCENE, start it if there is no "
-            "file yet",
-            "OUT.h5",
-            checked_file,
-        ),
+        "continue the stopped run that wrote this file; with SCENE, start it if there is no "
+        "file yet",
+        metavar="OUT.h5",
+        type=checked_file,
     )
-    force: bool = given(False, Option("resume with a changed scene or changed options"))
+    force: bool = given(
+        False, "resume with a changed scene or changed options", action="store_true"
+    )
     checkpoint_every: int | None = given(
         None,
-        Option(
-            "frames between checkpoints; default: so that they take at most 1% of the time",
-            "N",
-            int,
-        ),
+        "frames between checkpoints; default: so that they take at most 1% of the time",
+        metavar="N",
+        type=int,
     )
     gather: bool = given(
         False,
-        Option("let rank 0 write for all ranks, for cluster nodes without a shared file system"),
+        "let rank 0 write for all ranks, for cluster nodes without a shared file system",
+        action="store_true",
     )
     true_error: int | None = given(
-        None, Option("solve every N-th step to rounding as well and store its true error", "N", int)
+        None,
+        "solve every N-th step to rounding as well and store its true error",
+        metavar="N",
+        type=int,
     )
     measure: File | None = given(
         None,
-        Option(
-            "write the cost of the run: times, products, memory, machine", "OUT.json", checked_file
-        ),
+        "write the cost of the run: times, products, memory, machine",
+        metavar="OUT.json",
+        type=checked_file,
     )
     export: File | None = given(
         None,
-        Option(
-            "write the first linear system of chosen steps into DIR/step_N, for other solvers",
-            "DIR",
-            checked_path,
-        ),
+        "write the first linear system of chosen steps into DIR/step_N, for other solvers",
+        metavar="DIR",
+        type=checked_path,
     )
     export_steps: str = given(
-        "", Option("steps whose systems --export writes; default: 1", "1,5,20")
+        "", "steps whose systems --export writes; default: 1", metavar="1,5,20"
     )
     petsc_options: str | Mapping[str, Any] = given(
         "",
-        Option(
-            'PETSc options of this run: "-ksp_rtol 1e-3 -ksp_view", or {"ksp_rtol": 1e-3}',
-            python=True,
-        ),
+        'PETSc options of this run: "-ksp_rtol 1e-3 -ksp_view", or {"ksp_rtol": 1e-3}',
+        python=True,
     )
-    quiet: bool = given(False, Option("show only warnings and errors", python=True))
+    quiet: bool = given(False, "show only warnings and errors", python=True)
     on_frame: "Callable[[Frame], object] | None" = given(
-        None,
-        Option("function called on all ranks with each frame after it is written", python=True),
+        None, "function called on all ranks with each frame after it is written", python=True
     )
 
     def __post_init__(self) -> None:
         """Raise InputError for invalid paths, numbers and contradictory options."""
         for name, option in OPTIONS.items():
             value = getattr(self, name)
-            if isinstance(value, str | os.PathLike) and option.kind in (checked_path, checked_file):
-                option.kind(os.fspath(value))
+            kind, choices = (option.keywords.get(key) for key in ("type", "choices"))
+            if isinstance(value, str | os.PathLike) and kind in (checked_path, checked_file):
+                kind(os.fspath(value))
             # argparse has converted words; Python may pass any type
-            if option.kind is int and not isinstance(value, Integral | None):
+            if kind is int and not isinstance(value, Integral | None):
                 raise InputError(f"{flag_of(name)} must be a whole number, not {value!r}")
-            if option.kind is int and value is not None and value < 1:
+            if kind is int and value is not None and value < 1:
                 raise InputError(f"{flag_of(name)} must be at least 1, not {value}")
-            if option.choices and value not in (None, *option.choices):
-                raise InputError(f"{flag_of(name)} is {' or '.join(option.choices)}, not {value!r}")
+            if choices and value not in (None, *choices):
+                raise InputError(f"{flag_of(name)} is {' or '.join(choices)}, not {value!r}")
         refuse_other_format("-o", self.output, RESULT_NAMES)
         refuse_other_format("--measure", self.measure, MEASURE_NAMES)
         if self.export_steps and not self.export:

@@ -2,11 +2,11 @@
 
 import argparse
 import sys
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 from msmpetsc.app.checks import checked_file, checked_path
-from msmpetsc.app.request import OPTIONS, RunRequest, flag_of
+from msmpetsc.app.request import OPTIONS, flag_of
 from msmpetsc.results.frame_choice import frames_in
 
 # names and keywords for argparse's ``add_argument``
@@ -63,35 +63,16 @@ def switch(name: str, about: str) -> Argument:
 
 def arguments_of_run() -> tuple[Argument, ...]:
     """Return the arguments of ``run``: the fields of a run request that are not Python's only."""
-    taken = []
-    for field in fields(RunRequest):
-        name = field.name
-        option = OPTIONS[name]
-        about = option.help.replace("%", "%%")
-        valued: dict[str, Any] = {
-            "type": option.kind,
-            "metavar": option.value or None,
-            "help": about,
-        }
-        if option.python:
-            continue
-        if name == "scene":
-            taken.append(argument(name, nargs="?", **valued))
-        elif field.default is False:
-            taken.append(switch(flag_of(name), about))
-        elif field.default == ():
-            taken.append(
-                argument(
-                    flag_of(name), action="append", default=[], metavar=option.value, help=about
-                )
-            )
-        else:
-            taken.append(
-                argument(
-                    *filter(None, [option.short, flag_of(name)]), choices=option.choices, **valued
-                )
-            )
-    return tuple(taken)
+    return tuple(
+        argument(
+            *option.short,
+            name if name == "scene" else flag_of(name),
+            help=option.help.replace("%", "%%"),
+            **option.keywords,
+        )
+        for name, option in OPTIONS.items()
+        if not option.python
+    )
 
 
 def at_least_1(word: str) -> int:

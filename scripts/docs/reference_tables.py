@@ -97,10 +97,10 @@ def options_of_run() -> str:
 
 def word_of_option(name: str, option: Option) -> str:
     """Return an option of a run as a user types it; "" if only Python takes it."""
-    value = option.value or "|".join(option.choices or ())
+    value = str(option.keywords.get("metavar") or "|".join(option.keywords.get("choices", ())))
     if option.python:
         return ""
-    return value if name == "scene" else f"{option.short} {flag_of(name)} {value}".strip()
+    return value if name == "scene" else " ".join([*option.short, flag_of(name), value]).strip()
 
 
 def commands() -> str:

@@ -3,7 +3,7 @@
 import os
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -137,26 +137,6 @@ def _remove_files(path: Path, log: bool) -> None:
         path.with_suffix(suffix).unlink(missing_ok=True)
 
 
-@dataclass
-class StudyResults:
-    """The rows of a study that are known, written to table.csv in the order of its cases."""
-
-    folder: Path
-    order: Sequence[str]
-    rows: dict[str, Row] = field(default_factory=dict)
-    _lock: Lock = field(default_factory=Lock)
-
-    def add(self, row: Row) -> None:
-        """Add the row of a case and write the table; safe to call from several threads."""
-        with self._lock:
-            self.rows[row["case"]] = row
-            self.write()
-
-    def write(self) -> None:
-        """Replace table.csv by the present rows."""
-        write_table(self.folder, [self.rows[case] for case in self.order if case in self.rows])
-
-
 @dataclass(frozen=True)
 class StudyPart:
     """Part ``index`` of ``count`` parts of a study's cases, counted from 1."""
@@ -205,20 +185,26 @@ def run_study(
         for name in ("runs", "references", PARTS):
             shutil.rmtree(own / name, ignore_errors=True)
     known = [own] if restart else [own, folder, *sorted((folder / PARTS).glob("*"))]
-    results = _continued(known, {case: every[case] for case in wanted} if part else every)
+    kept = {case: every[case] for case in wanted} if part else every
+    rows = _continued(known, kept)
+
+    def add(*measured: Row) -> None:
+        rows.update({row["case"]: row for row in measured})
+        write_table(own, [rows[case] for case in kept if case in rows])
+
     write_whole(own / "study.toml", path.read_bytes())
-    results.write()
-    todo = [every[case] for case in wanted if not _is_done(every[case], results.rows)]
+    add()
+    todo = [every[case] for case in wanted if not _is_done(every[case], rows)]
     bench = Bench(own, Processes(), path.stem)
-    _carry_out(bench, todo, results, jobs=jobs or study.jobs, done=len(wanted) - len(todo))
-    return [results.rows[case] for case in wanted]
+    _carry_out(bench, todo, add, jobs=jobs or study.jobs, done=len(wanted) - len(todo))
+    return [rows[case] for case in wanted]
 
 
 def list_study(path: Path, folder: Path, full: bool = False) -> list[tuple[Case, bool]]:
     """Return each case of a study file and whether it is done, without running any."""
     require_extra()
     every, wanted = _cases(load_study(path), path, full)
-    rows = _continued([folder, *sorted((folder / PARTS).glob("*"))], every).rows
+    rows = _continued([folder, *sorted((folder / PARTS).glob("*"))], every)
     return [(every[case], _is_done(every[case], rows)) for case in wanted]
 
 
@@ -229,18 +215,18 @@ def _cases(study: Study, path: Path, full: bool) -> tuple[dict[str, Case], Seque
 
 
 def _carry_out(
-    bench: Bench, todo: Sequence[Case], results: StudyResults, *, jobs: int, done: int
+    bench: Bench, todo: Sequence[Case], add: Callable[[Row], None], *, jobs: int, done: int
 ) -> None:
     """Run cases and add their rows, with a progress bar that starts at ``done``."""
     bar = tqdm(total=done + len(todo), initial=done, unit="case", dynamic_ncols=True, disable=None)
     pool = ThreadPoolExecutor(jobs)
     try:
         with bar:
-            futures = [pool.submit(_run_and_add, bench, case, results) for case in todo]
+            futures = [pool.submit(bench.measure, case) for case in todo]
             for count, future in enumerate(as_completed(futures), done + 1):
-                bar.write(
-                    f"case {count}/{bar.total}  {described(future.result())}", file=sys.stderr
-                )
+                row = future.result()
+                add(row)
+                bar.write(f"case {count}/{bar.total}  {described(row)}", file=sys.stderr)
                 bar.update()
     finally:
         # after an exception or an interrupt runs may be in progress
@@ -249,14 +235,6 @@ def _carry_out(
         # the folder is not empty if a failed case has left its log
         with suppress(OSError):
             (bench.folder / "runs").rmdir()
-
-
-def _run_and_add(bench: Bench, case: Case, results: StudyResults) -> Row:
-    """Run a case and write its row before the thread takes its next case."""
-    row = bench.measure(case)
-    if not bench.processes.stopped:
-        results.add(row)
-    return row
 
 
 def described(row: Row) -> str:
@@ -269,18 +247,17 @@ def described(row: Row) -> str:
 # ---- results of earlier runs
 
 
-def _continued(folders: Sequence[Path], by_id: dict[str, Case]) -> StudyResults:
+def _continued(folders: Sequence[Path], by_id: dict[str, Case]) -> dict[str, Row]:
     """Return the rows of these cases from earlier runs, with their present labels.
 
-    If several folders have a row of a case, the first row that is done is taken. The results belong
-    to the first folder.
+    If several folders have a row of a case, the first row that is done is taken.
     """
-    results = StudyResults(folders[0], list(by_id))
+    known: dict[str, Row] = {}
     for folder in dict.fromkeys(folders):
         rows = {row["case"]: row for row in _earlier_rows(folder) if row["case"] in by_id}
-        new = {case: row for case, row in rows.items() if not _is_done(by_id[case], results.rows)}
-        results.rows |= {case: row | {"label": by_id[case].label} for case, row in new.items()}
-    return results
+        new = {case: row for case, row in rows.items() if not _is_done(by_id[case], known)}
+        known |= {case: row | {"label": by_id[case].label} for case, row in new.items()}
+    return known
 
 
 def _earlier_rows(folder: Path) -> list[Row]:

@@ -4,7 +4,7 @@ Functions import pandas themselves, because commands without a table should not 
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -49,9 +49,7 @@ def require_extra() -> None:
 
 def write_table(folder: Path, rows: Sequence[Row]) -> None:
     """Write table.csv: counts as integers, an empty entry for a value that was not measured."""
-    table = (
-        as_table(rows).replace([math.inf, -math.inf], math.nan).convert_dtypes(convert_string=False)
-    )
+    table = as_table(rows).convert_dtypes(convert_string=False)
     write_whole(folder / "table.csv", table.to_csv(index=False, lineterminator="\r\n"))
 
 
@@ -63,29 +61,25 @@ def read_table(folder: Path) -> "DataFrame":
     if not path.is_file():
         raise InputError(f"no table.csv in {folder}: it is no folder of a study")
     try:
-        texts = pandas.read_csv(path, dtype=str, keep_default_na=False, index_col=False).fillna("")
+        texts = pandas.read_csv(path, dtype=str, keep_default_na=False, index_col=False)
     except ValueError as error:
         # from pandas' parser, or for text that is not UTF-8
         raise InputError(
             f"{path} is not the table of a study: {str(error).splitlines()[0]}"
         ) from None
-    # mypy cannot know that the columns' names are strings
-    return typed(texts.to_dict("records"))  # type: ignore[arg-type]
+    return as_table(texts)
 
 
-def as_table(rows: Sequence[Row]) -> "DataFrame":
-    """Return rows as a DataFrame with all columns; a missing number is NaN, a missing text ""."""
+def as_table(rows: "Sequence[Row] | DataFrame") -> "DataFrame":
+    """Return rows of values or texts as a DataFrame with all columns.
+
+    A number that is missing, not finite or not readable is NaN; a missing text is "".
+    """
     from pandas import DataFrame
 
-    table = DataFrame(rows, columns=COLUMNS).astype(dict.fromkeys(NUMBERS, float))
-    return table.astype(dict.fromkeys(TEXT, object)).fillna(dict.fromkeys(TEXT, ""))
-
-
-def typed(texts: Iterable[Mapping[str, str]]) -> "DataFrame":
-    """Return rows of text as a DataFrame; numbers that are not finite or readable are NaN."""
-    return as_table(
-        [{**row, **{name: _number(row.get(name, "")) for name in NUMBERS}} for row in texts]
-    )
+    table = DataFrame(rows, columns=COLUMNS).astype(object)
+    numbers = {name: table[name].map(_number).astype(float) for name in NUMBERS}
+    return table.assign(**numbers).fillna(dict.fromkeys(TEXT, ""))
 
 
 def records(table: "DataFrame") -> list[Row]:
@@ -95,13 +89,13 @@ def records(table: "DataFrame") -> list[Row]:
     return plain.where(plain.notna(), None).to_dict("records")  # type: ignore[return-value]
 
 
-def _number(text: str) -> float:
-    """Return a finite number as Python reads it, or NaN."""
+def _number(value: Any) -> float:
+    """Return a finite number, of text as Python reads it, or NaN."""
     try:
-        value = float(text)
-    except ValueError:
+        number = float(value)
+    except (TypeError, ValueError):
         return math.nan
-    return value if math.isfinite(value) else math.nan
+    return number if math.isfinite(number) else math.nan
 
 
 def succeeded(table: "DataFrame") -> "DataFrame":

@@ -23,7 +23,7 @@ from msmpetsc.study.charts.curves import (
 from msmpetsc.study.charts.plot import RING, Axes, Chart, curve_styles
 from msmpetsc.study.charts.profile import comparable, profile_charts, ratios
 from msmpetsc.study.report import write_report
-from msmpetsc.study.table import read_table, succeeded, typed
+from msmpetsc.study.table import as_table, read_table, succeeded
 
 ERRORS = [
     row_of(
@@ -108,14 +108,14 @@ def test_the_front_is_what_nothing_beats(points: list[tuple[float, float]]):
 
 
 def test_errors_that_read_alike_are_no_reason_to_pay_more():
-    rows = typed(
-        row_of("a", true_error=e, time_frame=t) for e, t in ((0.10001, 1), (0.1, 2), (0.02, 3))
+    rows = as_table(
+        [row_of("a", true_error=e, time_frame=t) for e, t in ((0.10001, 1), (0.1, 2), (0.02, 3))]
     )
     assert list(front_rows(rows, STEP)["time_frame"]) == [3, 1]
 
 
 def test_the_cheapest_is_a_measured_point_and_each_error_has_its_own():
-    rows = succeeded(typed(ERRORS))
+    rows = succeeded(as_table(ERRORS))
     best = [contenders(rows, STEP, error) for error in (1e-1, 5e-3, 1e-4)]
     assert [[*row[["label", "error"]].itertuples(index=False, name=None)] for row in best] == [
         [("anderson", 1e-2)], [("newton", 1e-2)], [("newton", 1e-4)],
@@ -150,11 +150,11 @@ NOISY = [
 
 
 def test_no_winner_is_told_within_its_noise():
-    rows = succeeded(typed(NOISY))
+    rows = succeeded(as_table(NOISY))
     assert [*contenders(rows, STEP, 1e-2)["label"]] == ["newton", "pipecg", "anderson", "anderson"]
     assert [*contenders(rows, STEP, 1e-3)["label"]] == ["anderson", "lbfgs"]
     assert [*contenders(rows[:1], STEP, 1e-2)["label"]] == ["newton"], "nothing else was measured"
-    once = typed(
+    once = as_table(
         [
             NOISY[0],
             row_of("cg", time_frame=0.02, true_error=4e-3),
@@ -197,10 +197,10 @@ def test_twenty_options_are_told_apart_by_colour_mark_and_dashes():
             and one.shape != other.shape
             and not {one.shape, other.shape} <= triangles
         )
-    rows = typed(
+    rows = as_table([
         row_of(label, cells=cells, error=error, time_frame=1, true_error=error)
         for label in styles for error in (1e-1, 1e-2, 1e-3, 1e-4) for cells in (1000, 2000)
-    )  # fmt: skip
+    ])  # fmt: skip
     (chart,) = growth_charts(rows, styles)
     assert len({(style.color, style.shape, *style.dash) for style in chart.styles.values()}) == 80
     lines = [layer for layer in chart.panels[0].layers if layer["mark"]["type"] == "line"]
@@ -221,7 +221,7 @@ def curves_in(chart: Chart) -> dict[str, set[str]]:
 
 
 def test_whiskers_reach_from_the_least_to_the_greatest_of_the_repeats():
-    rows = typed(
+    rows = as_table(
         [
             *NOISY,
             *(
@@ -247,13 +247,13 @@ def test_whiskers_reach_from_the_least_to_the_greatest_of_the_repeats():
     for panel in (*pareto.panels, *growth.panels):
         low, high = panel.y["scale"]["domain"]
         assert all(low <= a <= b <= high for a, b in ends(panel))
-    once = pareto_charts(typed(ERRORS), curve_styles(row["label"] for row in ERRORS))[0]
+    once = pareto_charts(as_table(ERRORS), curve_styles(row["label"] for row in ERRORS))[0]
     assert not any(map(ends, once.panels))
 
 
 def test_only_equal_time_steps_are_compared_by_the_step_error():
     longer = row_of("lbfgs", time_step=0.04, time_frame=0.01, true_error=1e-5, trajectory_error=0.5)
-    rows = typed([*ERRORS, longer])
+    rows = as_table([*ERRORS, longer])
     (chart,) = pareto_charts(rows, curve_styles(rows["label"]))
     shown = curves_in(chart)
     assert shown["over the step error, time step 10 ms"] == {"newton", "anderson"}
@@ -263,10 +263,12 @@ def test_only_equal_time_steps_are_compared_by_the_step_error():
 
 
 def test_curves_of_one_label_are_told_apart_by_what_varies():
-    rows = typed(
-        row_of("cg", cells=c, error=e, time_frame=1, true_error=e)
-        for e in (1e-2, 1e-4)
-        for c in (2000, 1000)
+    rows = as_table(
+        [
+            row_of("cg", cells=c, error=e, time_frame=1, true_error=e)
+            for e in (1e-2, 1e-4)
+            for c in (2000, 1000)
+        ]
     )
     (chart,) = growth_charts(rows, curve_styles(["cg"]))
     assert list(chart.styles) == [
@@ -394,7 +396,7 @@ def profiled() -> list[dict[str, str]]:
 def test_a_profile_is_the_share_within_each_factor():
     """Factors of newton: 1, 2, 2, 1; of anderson: 3, 1, 1, fails. All fail on the fifth problem,
     whose cells nobody has counted."""
-    table = typed(profiled())
+    table = as_table(profiled())
     (chart,) = profile_charts(table, curve_styles(table["label"]))
     (problems,) = comparable(table)
     found = ratios(problems, "time_frame")
@@ -412,7 +414,7 @@ def test_a_profile_is_the_share_within_each_factor():
 
 
 def test_a_profile_needs_three_problems_with_the_same_methods():
-    table = typed(row for row in profiled() if row["cells"] in ("1000", "2000"))
+    table = as_table([row for row in profiled() if row["cells"] in ("1000", "2000")])
     assert not profile_charts(table, curve_styles(table["label"]))
-    alone = typed(row for row in profiled() if row["label"] == "newton")
+    alone = as_table([row for row in profiled() if row["label"] == "newton"])
     assert not profile_charts(alone, curve_styles(alone["label"]))

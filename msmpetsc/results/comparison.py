@@ -10,7 +10,6 @@ Both have the same points, so nothing is projected or interpolated. The weight o
 of the area of its triangles.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -91,7 +90,7 @@ def compare(a: Result, b: Result) -> Comparison:
     if not len(pairs):
         raise InputError(f"{a.path} and {b.path} have no finished frame of the same time")
     distances = {name: _distances(a, b, name, pairs) for name in chosen}
-    scales = _scales(a, b, distances, pairs)
+    scales = _scales(a, {name: size for name, (_, _, size) in distances.items()})
     fields = []
     for name, (greatest, worst, _) in distances.items():
         errors = np.where(greatest == 0, 0.0, greatest / scales[name])
@@ -110,7 +109,8 @@ def rest_of(run: Result, name: str) -> Positions | None:
 def _distances(a: Result, b: Result, name: str, pairs: Indices) -> Distances:
     """Return a field's largest difference, the row of it, (p,) each, and the field's largest size.
 
-    Sizes are taken over all compared frames, for positions relative to rest.
+    Sizes are taken over all compared frames, for positions relative to rest. The zero of the
+    potential energy is arbitrary, so its sizes are relative to the first compared frame.
     """
     a_rows, b_rows = a.frames[name], b.frames[name]
     if a_rows.shape[1:] != b_rows.shape[1:]:
@@ -119,6 +119,10 @@ def _distances(a: Result, b: Result, name: str, pairs: Indices) -> Distances:
             f"{b_rows.shape[1:]} in {b.path}"
         )
     rest = rest_of(a, name)
+    origins = [
+        rows[first] if name == "potential" else rest
+        for rows, first in zip((a_rows, b_rows), pairs[0], strict=True)
+    ]
     digits = max(
         float(np.finfo(rows.dtype).eps) if rows.dtype.kind == "f" else 0.0
         for rows in (a_rows, b_rows)
@@ -133,8 +137,8 @@ def _distances(a: Result, b: Result, name: str, pairs: Indices) -> Distances:
         distance = _row_lengths(difference(a_values, b_values, digits))
         worst[number] = np.argmax(distance) if distance.size else 0
         greatest[number] = distance[worst[number]] if distance.size else 0.0
-        for values in (a_values, b_values):
-            sizes = _row_lengths(values if rest is None else values - rest)
+        for values, origin in zip((a_values, b_values), origins, strict=True):
+            sizes = _row_lengths(values if origin is None else values - origin)
             size = max(size, sizes[np.isfinite(sizes)].max(initial=0.0))
     return greatest, worst, float(size)
 
@@ -157,26 +161,22 @@ def _row_lengths(rows: Array) -> Floats:
     return np.ravel(np.linalg.norm(rows, axis=-1))
 
 
-def _scales(
-    a: Result, b: Result, distances: dict[str, Distances], pairs: Indices
-) -> dict[str, float]:
-    """Return the scale of each field, the denominator of its errors."""
-    scales = {name: size for name, (_, _, size) in distances.items()}
+def _scales(a: Result, sizes: dict[str, float]) -> dict[str, float]:
+    """Return the scale of each field, the denominator of its errors, from the fields' sizes."""
     side = longest_side(a.lattice.nodes[:], a.body_of("lattice"))
     # energy [J] of the stiffest and longest spring at LEAST_STRAIN
     least = 0.0
     if all(name in a.lattice and len(a.lattice[name]) for name in ("stiffness", "rest_length")):
         longest = a.lattice.rest_length[:].max()
         least = float(0.5 * a.lattice.stiffness[:].max() * (LEAST_STRAIN * longest) ** 2)
-    energy, kinetic = (
-        max(least, _largest(a, b, pairs, names)) for names in (ENERGIES, ["kinetic"])
-    )
-    for name in scales:
+    scales = dict(sizes)
+    for name in sizes:
         if name in ENERGIES:
-            scales[name] = energy
+            scales[name] = max([least, *(sizes[of] for of in ENERGIES if of in sizes)])
         elif FRAME_FIELDS[name].at_rest:
-            scales[name] = max(scales[name], LEAST_STRAIN * side)
-    if "momentum" in scales and "mass" in a.lattice and kinetic > 0:
+            scales[name] = max(sizes[name], LEAST_STRAIN * side)
+    kinetic = max(least, sizes.get("kinetic", 0.0))
+    if "momentum" in sizes and "mass" in a.lattice and kinetic > 0:
         scales["momentum"] = float(np.sqrt(2 * a.lattice.mass[:].sum() * kinetic))
     return scales
 
@@ -188,21 +188,6 @@ def longest_side(points: Positions, body: Indices) -> float:
     """
     of_bodies = (points[body == number] for number in np.unique(body))
     return float(max((np.ptp(own, axis=0).max() for own in of_bodies), default=0.0))
-
-
-def _largest(a: Result, b: Result, pairs: Indices, names: Sequence[str]) -> float:
-    """Return the largest absolute value [J] of the named energies at the compared frames."""
-    runs = (a, pairs[:, 0]), (b, pairs[:, 1])
-    energies = [
-        (name, run.frames[name][frames])
-        for run, frames in runs
-        for name in names
-        if name in run.frames
-    ]
-    # the zero of the potential energy is arbitrary
-    values = [energy - energy[0] if name == "potential" else energy for name, energy in energies]
-    sizes = np.abs(np.concatenate([np.empty(0), *values]))
-    return float(sizes[np.isfinite(sizes)].max(initial=0.0))
 
 
 def rows_agree(a: Array, b: Array, tolerance: float) -> Mask:
@@ -275,7 +260,7 @@ def compare_surfaces(run: Result, reference: Result) -> Comparison:
     """
     refuse_different_meshes(run, reference)
     rest = reference["surface/points"][:]
-    area = point_areas(reference)
+    area = point_areas(rest, reference.indices("surface/triangles"))
     times = run.frames.time[:]
     pairs = common_times(times, reference.frames.time[:])
     if reference.scene.get("time", {}).get("integrator") == "static":
@@ -304,11 +289,9 @@ def compare_surfaces(run: Result, reference: Result) -> Comparison:
     return Comparison(pairs, times[pairs[:, 0]], [surface, mean], [])
 
 
-def point_areas(run: Result) -> Array:
-    """Return the area (v,) [m^2] of each surface point at rest: a third of its triangles' area."""
-    points = run["surface/points"][:]
-    triangles = run.indices("surface/triangles")
-    a, b, c = (points[triangles[:, corner]] for corner in range(3))
+def point_areas(points: Positions, triangles: Indices) -> Array:
+    """Return the area (v,) [m^2] around each point: a third of its triangles' area."""
+    a, b, c = points[triangles].swapaxes(0, 1)
     areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
     around = np.bincount(triangles.ravel(), np.repeat(areas / 3, 3), len(points))
     return around if around.sum() > 0 else np.ones(len(points))

@@ -9,6 +9,7 @@ from matplotlib.ticker import MaxNLocator
 
 from msmpetsc.backend.arrays import Array, Floats
 from msmpetsc.errors import InputError, did_you_mean
+from msmpetsc.results.comparison import point_areas
 from msmpetsc.view.drawable import Drawable
 
 FIXED, ARROW, INK = "#46566b", "#cf5a3c", "#333a42"
@@ -200,9 +201,7 @@ COLOURINGS: dict[str, Callable[[Drawable], Colouring]] = {
 
 def scaled(colouring: Colouring, subject: Drawable, frames: Iterable[int]) -> Colouring:
     """Return a field with a scale for these frames that a few extreme points do not stretch."""
-    a, b, c = subject.rest.points[subject.triangles].swapaxes(0, 1)
-    area = np.repeat(np.linalg.norm(np.cross(b - a, c - a), axis=1), 3)
-    weight = np.bincount(subject.triangles.ravel(), area, len(subject.rest.points))
+    weight = point_areas(subject.rest.points, subject.triangles)
     high = most = 0.0
     for index in frames:
         values = np.nan_to_num(colouring.values(index))

@@ -206,7 +206,7 @@ def test_runs_of_one_mesh_on_other_lattices_are_compared_by_their_surfaces(
     with Result(a) as one, Result(b) as other:
         _, mean = compare_surfaces(one, other).fields
         assert mean.scale == pytest.approx(largest, rel=1e-6)
-        areas = point_areas(one)
+        areas = areas_of(one)
     rms = 0.02 * np.sqrt(areas[3] / areas.sum())
     assert mean.errors * mean.scale == pytest.approx([0, 0, rms, rms, rms], rel=1e-4, abs=1e-8)
     assert surface_error(a, b) == pytest.approx(rms * np.sqrt(3 / 5) / largest, rel=1e-4)
@@ -214,9 +214,13 @@ def test_runs_of_one_mesh_on_other_lattices_are_compared_by_their_surfaces(
     assert told(capsys, a, b, "--rtol", "1")[0] == 0
 
 
+def areas_of(run: Result) -> np.ndarray:
+    return point_areas(run["surface/points"][:], run.indices("surface/triangles"))
+
+
 def test_points_count_by_the_area_around_them(a: Path):
     with Result(a) as run:
-        p, areas = POINTS, point_areas(run)
+        p, areas = POINTS, areas_of(run)
     first, second = (
         np.linalg.norm(np.cross(p[b] - p[a], p[c] - p[a])) / 6 for a, b, c in ((0, 1, 2), (1, 2, 3))
     )

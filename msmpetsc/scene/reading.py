@@ -82,14 +82,7 @@ class Scene(SceneFile):
         InputError
             Has a line for each problem of the scene.
         """
-        path = Path(folder) / "scene"
-        data = plain(tables)
-        keys = {_override(data, override): override for override in overrides_of(changes)}
-        checked = _checked(path, data, "", keys)
-        try:
-            return Scene(**_given(checked), text=tomli_w.dumps(data), folder=path.parent)
-        except TypeError as error:
-            raise InputError(f"{path}: cannot be written as TOML: {error}") from None
+        return _checked(Path(folder) / "scene", plain(tables), "", changes)[0]
 
     def changed(self, changes: Changes) -> "Scene":
         """Return a checked copy of the scene with changes.
@@ -144,28 +137,32 @@ def scene_of(
     data = _parse(path, text)
     if "mesh" not in data and not OF_STUDIES.isdisjoint(data):
         raise InputError(f"{path}: is a study, no scene: msmpetsc study {shlex.quote(str(path))}")
-    keys = {_override(data, override): override for override in overrides_of(changes)}
-    checked = _checked(path, data, text, keys)
+    scene, keys = _checked(path, data, text, changes)
     if to_read:
-        _refuse_outside(path, checked, keys if by_user else None)
-    return Scene(**_given(checked), text=tomli_w.dumps(data) if keys else text, folder=path.parent)
+        _refuse_outside(path, scene, keys if by_user else None)
+    return scene
 
 
-def _given(scene: SceneFile) -> dict[str, Any]:
-    """Return the tables that were given, so that absent ``mesh`` or ``body`` stays absent."""
-    return {name: getattr(scene, name) for name in scene.model_fields_set}
+def _checked(
+    path: Path, data: dict[str, Any], text: str, changes: Changes
+) -> tuple[Scene, Collection[KeyPath]]:
+    """Return the checked scene, and the key paths that the changes set.
 
+    text : TOML text of ``data``, in which problems are located; "" for tables
 
-def _checked(path: Path, data: dict[str, Any], text: str, keys: dict[KeyPath, str]) -> SceneFile:
-    """Return the checked tables. Raises InputError with a line for each problem.
-
-    text : TOML text of ``data``, in which problems are located
-    keys : override of each overridden key path
+    Raises InputError with a line for each problem.
     """
+    keys = {_override(data, override): override for override in overrides_of(changes)}
     try:
-        return SceneFile.model_validate(data)
+        checked = SceneFile.model_validate(data)
+        # absent ``mesh`` or ``body`` stays absent
+        given = {name: getattr(checked, name) for name in checked.model_fields_set}
+        text = tomli_w.dumps(data) if keys or not text else text
+        return Scene(**given, text=text, folder=path.parent), keys
     except ValidationError as error:
         raise InputError("\n".join(problem_lines(path, error, text, keys))) from None
+    except TypeError as error:
+        raise InputError(f"{path}: cannot be written as TOML: {error}") from None
 
 
 def read_toml(path: Path, kind: str = "scene") -> tuple[str, dict[str, Any]]:

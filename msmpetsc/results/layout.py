@@ -4,7 +4,7 @@ All metadata is written before the first frame and then does not change, so a ki
 readable file. Every dataset of ``/frames`` and ``/checkpoint`` has its planned length from the
 start, its chunks are allocated, and nothing is buffered.
 
-Rank 0, which has the file open, transfers the rows of other ranks in pieces. Alternatively each
+Rank 0, which has the file open, transfers the rows of one rank after another. Alternatively each
 rank writes its own rows straight to their bytes: uncompressed chunks stay at the offsets that HDF5
 gave them at the start. This needs no parallel h5py. As nothing is collective, no rank waits for
 a rank that has failed.
@@ -22,14 +22,13 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Array
+from msmpetsc.comm import starts
 from msmpetsc.errors import InputError
 from msmpetsc.fields import DIMENSIONS, FIELDS, FRAME_FIELDS, LABELS, RANKS_SHARE, unit_of
 from msmpetsc.results.disk import Storage
 
 # largest size of a chunk [byte]; bounds the memory of a reader
 CHUNK_BYTES = 64 * 2**20
-# largest size of the rows that rank 0 holds of another rank [byte]
-PIECE_BYTES = 64 * 2**20
 # netCDF-4's name of a dimension scale without coordinates
 LENGTH_ALONE = "This is a netCDF dimension but not a netCDF variable."
 
@@ -181,40 +180,24 @@ def _name_axes(frames: h5py.Group, name: str) -> None:
         frames[name].dims[axis].attach_scale(frames[dimension])
 
 
-def pieces(rows: Array, counts: Sequence[int]) -> Iterator[tuple[int, slice, slice]]:
-    """Yield pieces of at most PIECE_BYTES: the rank, the slice of its rows and of all rows.
-
-    rows   : (counts[rank], ...) this rank's rows
-    counts : number of rows of each rank
-    """
-    most = max(1, PIECE_BYTES // max(1, rows.dtype.itemsize * math.prod(rows.shape[1:])))
-    start = 0
-    for rank, count in enumerate(counts):
-        for begin in range(0, count, most):
-            end = min(begin + most, count)
-            yield rank, slice(begin, end), slice(start + begin, start + end)
-        start += count
-
-
 def gather_rows(
     comm: MPI.Comm, rows: Array, counts: Sequence[int], store: Callable[[slice, Array], None]
 ) -> None:
-    """Call store(part, piece) on rank 0 for the rows of all ranks, in order (collective).
+    """Call store(part, piece) on rank 0 for the rows of each rank, in order (collective).
 
     rows   : (counts[rank], ...) this rank's rows, contiguous
     counts : number of rows of each rank
 
     Raises the first OSError of ``store`` on rank 0.
     """
+    if comm.rank > 0:
+        comm.Send(rows, dest=0)
+        return
     failure = None
-    for rank, own, part in pieces(rows, counts):
-        if comm.rank == rank > 0:
-            comm.Send(rows[own], dest=0)
-        if comm.rank > 0:
-            continue
-        piece = rows[own]
+    for rank, part in enumerate(_parts(counts)):
+        piece = rows
         if rank > 0:
-            piece = np.empty((own.stop - own.start, *rows.shape[1:]), rows.dtype)
+            piece = np.empty((counts[rank], *rows.shape[1:]), rows.dtype)
             comm.Recv(piece, source=rank)
         try:
             if failure is None:
@@ -234,13 +217,12 @@ def scatter_rows(
     rows   : (counts[rank], ...) this rank's rows, to be filled
     counts : number of rows of each rank
     """
+    if comm.rank > 0:
+        comm.Recv(rows, source=0)
+        return None
     failure: Exception | None = None
-    for rank, own, part in pieces(rows, counts):
-        if comm.rank == rank > 0:
-            comm.Recv(rows[own], source=0)
-        if comm.rank > 0:
-            continue
-        piece = np.zeros((own.stop - own.start, *rows.shape[1:]), rows.dtype)
+    for rank, part in enumerate(_parts(counts)):
+        piece = rows if rank == 0 else np.zeros((counts[rank], *rows.shape[1:]), rows.dtype)
         try:
             piece[...] = load(part)
         except InputError as error:
@@ -248,9 +230,13 @@ def scatter_rows(
             failure = error
         if rank > 0:
             comm.Send(piece, dest=rank)
-        else:
-            rows[own] = piece
     return failure
+
+
+def _parts(counts: Sequence[int]) -> Iterator[slice]:
+    """Yield the slice of all rows that each rank has."""
+    for start, count in zip(starts(np.array(counts)).tolist(), counts, strict=True):
+        yield slice(start, start + count)
 
 
 def open_on_all_ranks(comm: MPI.Comm, path: Path) -> int | None:

@@ -45,8 +45,8 @@ def share(rows: int) -> slice:
 
 
 def write_all(path: str, gathers: bool = False) -> None:
-    # several pieces and several chunks on each rank
-    layout.PIECE_BYTES, layout.CHUNK_BYTES = 100, 5 * 24
+    # several chunks on each rank
+    layout.CHUNK_BYTES = 5 * 24
     nodes, points = share(NODES), share(POINTS)
     with ResultFile(
         path, MPI.COMM_WORLD, {"scene": "title = 'a test'", "ranks": 3}, gathers=gathers
@@ -84,7 +84,6 @@ def fill_disk(path: str, gathers: bool = True) -> None:
 
     Without gathering, it is full for a rank in the midst of its rows.
     """
-    layout.PIECE_BYTES = 100
     nodes = share(NODES)
     store = h5py.Dataset.__setitem__
 

@@ -71,7 +71,8 @@ DEBRIS = 0.01
 COLUMN = 39
 # preparation step that turns y upwards into z upwards
 TURN = "{ rotate = { axis = [1, 0, 0], degrees = 90 } }"
-GRAVITY = ["[gravity]", "acceleration = [0, 0, -9.81]           # [m/s^2]"]
+GRAVITY = """[gravity]
+acceleration = [0, 0, -9.81] # [m/s^2]"""
 
 
 def run(args: argparse.Namespace) -> int:
@@ -283,20 +284,24 @@ def stability(surface: Surface, axis: int, sign: int) -> float:
 
 def draft(source: str, title: str, mesh: MeshMeasures) -> str:
     """Return the text of a scene for a mesh that the scene names ``source``."""
-    head = [
-        f"#:schema {SCHEMA_FILE}",
-        "# A first draft by msmpetsc new: adjust every value. All keys: msmpetsc keys",
-        f"title = {json.dumps(title, ensure_ascii=False)}",
-    ]
+    head = f"""#:schema {SCHEMA_FILE}
+# A first draft by msmpetsc new: adjust every value. All keys: msmpetsc keys
+title = {json.dumps(title, ensure_ascii=False)}
+
+"""
     moved = _falling(mesh) if mesh.beam_axis is None else _clamped(mesh, mesh.beam_axis)
-    return "\n".join([*head, "", *_mesh(source, mesh), "", *_cages(mesh), "", *moved]) + "\n"
+    tables = "\n\n".join([_mesh(source, mesh), _cages(mesh), moved])
+    return head + "".join(f"{_aligned(line)}\n" for line in tables.split("\n"))
 
 
-def _mesh(source: str, mesh: MeshMeasures) -> list[str]:
-    """Return the lines of the table of the mesh, with comments on its defects."""
+def _mesh(source: str, mesh: MeshMeasures) -> str:
+    """Return the table of the mesh, with comments on its defects."""
     report = mesh.report
-    lines = ["[mesh]", line(f"source = {json.dumps(source, ensure_ascii=False)}", mesh.words)]
-    lines.append(f"# {mesh.up} is taken for upwards: msmpetsc new --up sets another axis")
+    lines = [
+        "[mesh]",
+        f"source = {json.dumps(source, ensure_ascii=False)} # {mesh.words}",
+        f"# {mesh.up} is taken for upwards: msmpetsc new --up sets another axis",
+    ]
     # reason of each preparation step
     steps = {}
     if len(mesh.parts) > 1 and mesh.parts[1:].sum() < DEBRIS:
@@ -320,61 +325,48 @@ def _mesh(source: str, mesh: MeshMeasures) -> list[str]:
             "# parts that share no cell move separately; "
             'prepare = ["union"] joins parts that overlap'
         )
-    lines.append(
-        line(f"size = {plain(mesh.sides.max(), 5)}", f"longest side [m]; {mesh.unit_words}")
-    )
+    lines.append(f"size = {plain(mesh.sides.max(), 5)} # longest side [m]; {mesh.unit_words}")
     if mesh.beam_axis is None:
-        drop = plain(DROP * mesh.sides[2], 2)
-        lines.append(
-            line(
-                f"base = [0, 0, {drop}]",
-                "centre of the bottom face [m]: the body falls a fifth of its height",
-            )
-        )
-    return lines
+        centre = "centre of the bottom face [m]: the body falls a fifth of its height"
+        lines.append(f"base = [0, 0, {plain(DROP * mesh.sides[2], 2)}] # {centre}")
+    return "\n".join(lines)
 
 
-def _cages(body: MeshMeasures) -> list[str]:
-    """Return the lines of the table of cages."""
+def _cages(body: MeshMeasures) -> str:
+    """Return the table of cages."""
     # by volume alone, as for a body of many cells
     size = body.thickness.advised_size(SOLID) if body.thickness else np.inf
     count = int(float(plain(min(max(body.volume / size**3, CELLS[0]), CELLS[1]), 1)))
-    cell_size = (body.volume / count) ** (1 / 3)
-    words = (
-        f"; the body is {thickness_words(body.thickness.cells(cell_size))}"
-        if body.thickness
-        else ""
-    )
-    return [
-        "[cages]",
-        line(f"count = {count}", f"cells{words}"),
-    ]
+    words = "cells"
+    if body.thickness:
+        cell_size = (body.volume / count) ** (1 / 3)
+        words += f"; the body is {thickness_words(body.thickness.cells(cell_size))}"
+    return f"[cages]\ncount = {count} # {words}"
 
 
-def _falling(body: MeshMeasures) -> list[str]:
-    """Return the lines of the tables of a body that falls on the ground."""
+def _falling(body: MeshMeasures) -> str:
+    """Return the tables of a body that falls on the ground."""
     height = float(body.sides[2])
     young = STIFFNESS * DENSITY * G * height
     # of a standing quarter wave along the height, with the speed sqrt(E / rho)
     period = 4 * height / math.sqrt(young / DENSITY)
     fall = math.sqrt(2 * DROP * height / G)
-    ground = [
-        "[[obstacle]]",
-        line(
-            'shape = "plane"',
-            "the ground; the body is no horizontal beam, so it falls",
-        ),
-        line("point = [0, 0, 0]", "[m]"),
-        line("normal = [0, 0, 1]", "towards the free side"),
-        line('response = "penalty"', 'or "reflect", with a restitution'),
-        line("friction = 0.5", "Coulomb's coefficient"),
-    ]
-    material = _material(young, f"its own weight compresses it by about {100 / STIFFNESS:g}%")
-    return [*material, "", *_time(2 * fall + PERIODS * period, period), "", *GRAVITY, "", *ground]
+    return f"""{_material(young, f"its own weight compresses it by about {100 / STIFFNESS:g}%")}
+
+{_time(2 * fall + PERIODS * period, period)}
+
+{GRAVITY}
+
+[[obstacle]]
+shape = "plane" # the ground; the body is no horizontal beam, so it falls
+point = [0, 0, 0] # [m]
+normal = [0, 0, 1] # towards the free side
+response = "penalty" # or "reflect", with a restitution
+friction = 0.5 # Coulomb's coefficient"""
 
 
-def _clamped(body: MeshMeasures, axis: int) -> list[str]:
-    """Return the lines of the tables of a body that is clamped at an end.
+def _clamped(body: MeshMeasures, axis: int) -> str:
+    """Return the tables of a body that is clamped at an end.
 
     The body counts as an Euler-Bernoulli beam of full rectangular section.
     """
@@ -386,39 +378,37 @@ def _clamped(body: MeshMeasures, axis: int) -> list[str]:
     direction = np.eye(3, dtype=int)[axis]
     point = ", ".join(f"{CLAMPED * component:g}" for component in direction)
     normal = ", ".join(str(-component) for component in direction)
-    region = f"half_space = {{ point = [{point}], normal = [{normal}] }}, relative = true"
-    pin = [
-        line("[[pin]]", "the body is a horizontal beam: an end is clamped"),
-        f"region = {{ {region} }}",
-    ]
-    material = _material(young, f"its end sinks by about {100 * SAG:g}% of its length")
-    return [*material, "", *_time(PERIODS * period, period), "", *GRAVITY, "", *pin]
+    return f"""{_material(young, f"its end sinks by about {100 * SAG:g}% of its length")}
+
+{_time(PERIODS * period, period)}
+
+{GRAVITY}
+
+[[pin]] # the body is a horizontal beam: an end is clamped
+region = {{ half_space = {{ point = [{point}], normal = [{normal}] }}, relative = true }}"""
 
 
-def _material(young: float, effect: str) -> list[str]:
-    """Return the lines of the table of the material."""
-    return [
-        "[material]",
-        line(f"young_modulus = {plain(young, 1)}", f"[Pa]; {effect}"),
-        line(f"density = {plain(DENSITY, 4)}", "[kg/m^3], as water"),
-        line('law = "neo-hookean"', 'a solid; "linear": the paper\'s springs'),
-        line("poisson_ratio = 0.25", "[-]; tissue has 0.45, rubber 0.49"),
-    ]
+def _material(young: float, effect: str) -> str:
+    """Return the table of the material."""
+    return f"""[material]
+young_modulus = {plain(young, 1)} # [Pa]; {effect}
+density = {plain(DENSITY, 4)} # [kg/m^3], as water
+law = "neo-hookean" # a solid; "linear": the paper's springs
+poisson_ratio = 0.25 # [-]; tissue has 0.45, rubber 0.49"""
 
 
-def _time(duration: float, period: float) -> list[str]:
-    """Return the lines of the table of time for a duration [s] and a slowest period [s]."""
+def _time(duration: float, period: float) -> str:
+    """Return the table of time for a duration [s] and a slowest period [s]."""
     step = float(plain(period / STEPS_A_PERIOD, 1))
-    return [
-        "[time]",
-        line(f"step = {step:g}", f"[s]; the slowest motion has a period of about {period:.2g} s"),
-        line(f"duration = {step * math.ceil(duration / step):.6g}", "[s]"),
-    ]
+    return f"""[time]
+step = {step:g} # [s]; the slowest motion has a period of about {period:.2g} s
+duration = {step * math.ceil(duration / step):.6g} # [s]"""
 
 
-def line(setting: str, comment: str) -> str:
-    """Return a line of TOML with a comment at a fixed column."""
-    return f"{setting:{COLUMN - 1}} # {comment}"
+def _aligned(line: str) -> str:
+    """Return a line of TOML with its comment, if it has one, at a fixed column."""
+    setting, mark, comment = line.rpartition(" # ")
+    return f"{setting:{COLUMN - 1}}{mark}{comment}" if mark else line
 
 
 def plain(value: float, digits: int) -> str:

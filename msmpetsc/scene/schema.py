@@ -199,6 +199,11 @@ class Picture(Table):
     )
 
 
+def table_of_defaults(table: type[Table], description: str) -> Any:
+    """Return the field of a table that has its default values if it is absent."""
+    return Field(default_factory=lambda: table.model_validate({}), description=description)
+
+
 class SceneFile(Table):
     """The tables of a scene file; ``SceneFile.model_json_schema()`` is its JSON schema."""
 
@@ -225,21 +230,10 @@ class SceneFile(Table):
     force: ListOf[Force] = Field((), description="forces on parts of the body")
     traction: ListOf[Traction] = Field((), description="dead loads on parts of the surface")
     pressure: ListOf[Pressure] = Field((), description="pressures on closed surfaces")
-    solver: Solver = Field(
-        default_factory=lambda: Solver.model_validate({}), description="solver of a time step"
-    )
-    safety: Safety = Field(
-        default_factory=lambda: Safety.model_validate({}),
-        description="recovery of steps that fail",
-    )
-    output: Output = Field(
-        default_factory=lambda: Output.model_validate({}),
-        description="optional content of the result file",
-    )
-    picture: Picture = Field(
-        default_factory=lambda: Picture.model_validate({}),
-        description="view of the result in pictures",
-    )
+    solver: Solver = table_of_defaults(Solver, "solver of a time step")
+    safety: Safety = table_of_defaults(Safety, "recovery of steps that fail")
+    output: Output = table_of_defaults(Output, "optional content of the result file")
+    picture: Picture = table_of_defaults(Picture, "view of the result in pictures")
 
     @model_validator(mode="before")
     @classmethod

@@ -11,6 +11,7 @@ from msmpetsc.results.disk import write_whole
 from msmpetsc.scene.reading import read_toml
 from msmpetsc.scene.toml import toml_value
 from msmpetsc.scene.values import IntegratorName
+from msmpetsc.study.cases import scene_tables
 
 # solver preset of implicit methods; it chooses the preconditioner itself
 PRESET = "newton"
@@ -106,17 +107,13 @@ def inverted_bound(trials: Sequence[SizeTrial], law: str) -> list[str]:
 Tables = Mapping[str, Mapping[str, Any]]
 
 
-def tables(method: PlannedMethod) -> Tables:
+def tables(method: PlannedMethod) -> dict[str, dict[str, Any]]:
     """Return the tables of a scene that a method determines; None stands for no key."""
-    # the default is left out
-    name = None if method.integrator == "implicit-euler" else method.integrator
-    time = {"integrator": name, "error": method.time_error, "substep": None}
-    if method.integrator == "verlet":
-        return {"time": time}
-    return {
-        "time": time,
-        "solver": {"preset": PRESET, "error": method.step_error, "max_iterations": None},
-    }
+    values: dict[str, Any] = {"integrator": method.integrator, "substep": None}
+    values |= {"preset": PRESET, "error": method.step_error, "max_iterations": None}
+    made = scene_tables(values)
+    made["time"]["error"] = method.time_error
+    return made
 
 
 def overrides(scene: Path, tables: Tables) -> list[str]:

@@ -8,6 +8,7 @@ divided edges, then duplicates.
 from dataclasses import replace
 from typing import Any
 
+import igl
 import numpy as np
 import pyvista as pv
 from scipy.sparse import csr_array, vstack
@@ -39,11 +40,9 @@ def _refined(subject: Drawable) -> Drawable:
     cell = float(np.ptp(rest.nodes[rest.cells[0]], axis=0).max())
     if cell == 0:
         return subject
-    a, b, c = rest.points[subject.triangles].swapaxes(0, 1)
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
-    points, triangles, part_of = subdivided(
-        rest.points, subject.triangles, max(cell, np.sqrt(2 * area / MAX_TRIANGLES))
-    )
+    doubled = igl.doublearea(rest.points, subject.triangles).sum()
+    longest = max(cell, np.sqrt(doubled / MAX_TRIANGLES))
+    points, triangles, part_of = subdivided(rest.points, subject.triangles, longest)
     body = np.append(rest.body_of_point, np.empty(len(points) - len(rest.points), int))
     given = subject.triangles[part_of]
     body[triangles] = body[given[:, :1]]

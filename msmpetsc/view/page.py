@@ -15,6 +15,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import igl
 import numpy as np
 
 from msmpetsc.backend.arrays import Array, Floats, Positions
@@ -136,10 +137,9 @@ def distinct(overlays: Sequence[Overlays]) -> dict[str, list[Any]]:
 def solid_facts(surface: Surface) -> dict[str, Floats]:
     """Return an obstacle's surface for the script: corners and normals of each triangle."""
     corners = surface.points[surface.triangles]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    tiny = np.finfo(float).tiny
-    normals /= np.maximum(np.linalg.norm(normals, axis=1), tiny)[:, None]
-    digits = 6 - int(np.floor(np.log10(np.abs(corners).max(initial=tiny))))
+    normals = igl.per_face_normals(surface.points, surface.triangles, np.zeros(3))
+    largest = np.abs(corners).max(initial=np.finfo(float).tiny)
+    digits = 6 - int(np.floor(np.log10(largest)))
     return {
         "corners": np.round(corners, digits).ravel(),
         "normals": np.round(np.repeat(normals, 3, axis=0), 3).ravel(),

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from shlex import quote
 
+import igl
 import numpy as np
-import trimesh
 from scipy.spatial import ConvexHull, QhullError
 
 import msmpetsc
@@ -221,8 +221,7 @@ def measured(surface: Surface, report: SurfaceReport, up: str) -> MeshMeasures:
     sides = np.ptp(surface.points[np.unique(surface.triangles)], axis=0)
     unit = unit_of(float(sides.max()))
     metres = unit or DEFAULT_SIZE / sides.max()
-    faces = trimesh.Trimesh(surface.points, surface.triangles, process=False)
-    areas = np.bincount(part_labels(surface), faces.area_faces)
+    areas = np.bincount(part_labels(surface), igl.doublearea(surface.points, surface.triangles))
     return MeshMeasures(
         up=up,
         unit=unit,
@@ -268,14 +267,14 @@ def stability(surface: Surface, axis: int, sign: int) -> float:
         whole = ConvexHull(plan[used])
     except QhullError:
         return 0.0
-    areas = trimesh.Trimesh(surface.points, surface.triangles, process=False).area_faces
+    areas = igl.doublearea(surface.points, surface.triangles)
     centre = areas @ plan[surface.triangles].mean(axis=1) / areas.sum()
     if not (base.equations[:, :2] @ centre + base.equations[:, 2] <= 0).all():
         return 0.0
     lowest = surface.triangles[is_low[surface.triangles].all(axis=1)]
     flat = np.insert(plan, 2, 0.0, axis=1)
     # the volume of a hull in two dimensions is an area
-    flatness = trimesh.Trimesh(flat, lowest, process=False).area / base.volume
+    flatness = igl.doublearea(flat, lowest).sum() / 2 / base.volume
     return float(base.volume / whole.volume * (1 - FLAT_PENALTY * min(flatness, 1.0)))
 
 

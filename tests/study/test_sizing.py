@@ -31,7 +31,7 @@ from msmpetsc.study.sizing.choice import (
     put_into,
     tables,
 )
-from msmpetsc.study.sizing.orders import ORDERS, cosine_of, error_law
+from msmpetsc.study.sizing.orders import ORDERS, ErrorLaw, cosine_of, error_law
 from msmpetsc.study.sizing.trials import Asked, Sizer
 from msmpetsc.study.table import Row
 
@@ -74,6 +74,12 @@ def test_without_an_order_two_sizes_alike_tell_less_than_two_far_apart():
     assert error_law((4, 2, 1), [0.05, 0.05], ORDERS, across=0.1).error(1) == pytest.approx(0.05)
     seen = [0.03 * (4**1.5 - 1.4**1.5), 0.03 * (1.4**1.5 - 1)]
     assert error_law(sizes, seen, ORDERS, across=1.0).error(1) == pytest.approx(0.03)
+
+
+def test_an_error_that_jumps_between_two_like_sizes_has_a_law():
+    """Its order would be 618, and 0.2^618 underflows."""
+    jump = ErrorLaw(1.0, 1.5).through((0.2, 0.5), (0.198, 0.001))
+    assert jump.error(0.2) == pytest.approx(0.5) and jump.size(0.1) < 0.2
 
 
 @pytest.mark.parametrize(("order", "cosine"), [(1.0, 0.0), (1.5, 0.0), (1.5, 0.5), (2.0, 0.9)])

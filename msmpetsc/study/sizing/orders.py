@@ -20,8 +20,8 @@ from scipy.optimize import brentq
 ORDERS = (1.0, 2.2)
 # ratio of sizes below which a random part hides the order
 SIMILAR_RATIO = 1.9
-# ratio of sizes below which two errors differ by their random part alone
-DISTINCT_RATIO = 1.01
+# steepest order through two runs [-]; so that powers of sizes stay finite
+STEEPEST = 100.0
 # distance of a measured order below the range at which it still counts as observed
 ORDER_TOLERANCE = 0.05
 
@@ -54,8 +54,8 @@ class ErrorLaw:
         """
         (a, error_a), (b, error_b) = known[0], known[-1]
         order = self.order
-        if a > DISTINCT_RATIO * b and error_a > error_b > 0:
-            order = math.log(error_a / error_b) / math.log(a / b)
+        if a > b and error_a > error_b > 0:
+            order = min(math.log(error_a / error_b) / math.log(a / b), STEEPEST)
         return replace(self, factor=error_a / a**order, order=order)
 
     def measured(self, distance: float, finer: float) -> float:

@@ -216,7 +216,6 @@ COMMANDS = {
         (
             "msmpetsc study my_study.toml --list",
             "msmpetsc study my_study.toml -o out/my_study --jobs 2",
-            "msmpetsc study my_study.toml --export out/systems --export-steps 1,5",
         ),
         (
             argument("study", type=checked_path, metavar="FILE.toml", help="study file"),
@@ -227,10 +226,6 @@ COMMANDS = {
             switch("--full", "also run the long cases, marked full = true"),
             whole("--jobs", "N", "number of cases to run at a time (they slow each other)"),
             switch("--restart", "run finished cases again"),
-            argument(
-                "--export-steps", default="", metavar="1,5,20",
-                help=OPTIONS["export_steps"].help,
-            ),
         ),
         (
             argument(
@@ -238,11 +233,6 @@ COMMANDS = {
                 help="run only the I-th of N parts, for several machines or array tasks",
             ),
             switch("--list", "list the cases and which are done, and run nothing"),
-            argument(
-                "--export", type=checked_path, metavar="DIR",
-                help="write linear systems of each scene into DIR, for other solvers, and run no "
-                "case",
-            ),
         ),
         "Run the cases of a study, each in its own process, and write a table and a report. "
         "After a stop the same command continues.",

@@ -19,7 +19,7 @@ from block_scene import (
 )
 from conftest import ROOT, python, run
 from mpi4py import MPI
-from one_process import command_error, input_error
+from one_process import command_error
 from petsc4py import PETSc
 from pinch import pinch_scene
 from scipy.sparse import csr_array
@@ -31,7 +31,6 @@ from msmpetsc.build import build_model
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.linear.assembled_hessian import assembled, blocks_of
 from msmpetsc.solve.simulate import TimeLoop
-from msmpetsc.study.exported_problems import export_systems
 
 SOLID = {"law": "neo-hookean", "young_modulus": 1e5, "density": 1000.0, "poisson_ratio": 0.3}
 SWING = {"step": 0.05, "duration": 0.15}
@@ -223,28 +222,6 @@ def test_a_held_component_has_its_diagonal_alone(tmp_path: Path):
     y = spsolve(hessian.tocsc(), right)
     atol = EXACT * np.abs(y).max()
     np.testing.assert_allclose(vector(folder, "correction"), y, rtol=0, atol=atol)
-
-
-def test_a_study_exports_each_problem_once(tmp_path: Path):
-    solid = {"young_modulus": 1e5, "density": 1000.0}
-    clamped_beam(tmp_path, name="beam", material=solid, time=SWING)
-    study = tmp_path / "study.toml"
-    study.write_text(
-        '[[scene]]\nname = "soft beam"\nfile = "beam.toml"\n'
-        '[[sweep]]\npresets = ["newton", "anderson"]\noptions = ["", "-pc_type icc"]\n'
-        'laws = ["linear", "neo-hookean"]\n'
-        '[[sweep]]\nintegrators = ["verlet"]\n'
-    )
-    folders = export_systems(study, tmp_path / "systems", "1,4")
-    assert [folder.name for folder in folders] == ["soft_beam", "soft_beam-2"]
-    names = {each.name for folder in folders for each in folder.iterdir()}
-    assert names == {"step_1", "step_4", "run.log"}
-    linear, solid = (matrix(folder / "step_4/hessian.bin") for folder in folders)
-    assert linear.shape == solid.shape and abs(linear - solid).max() > 0
-    study.write_text(
-        '[[scene]]\nname = "a"\nfile = "beam.toml"\n[[sweep]]\nintegrators = ["verlet"]\n'
-    )
-    assert "no sweep solves" in input_error(lambda: export_systems(study, tmp_path, ""))
 
 
 @pytest.mark.parametrize(

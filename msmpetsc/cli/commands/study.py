@@ -6,19 +6,12 @@ from pathlib import Path
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, printable
 from msmpetsc.study.cases import shown_command
-from msmpetsc.study.exported_problems import export_systems
 from msmpetsc.study.runner import StudyPart, list_study, run_study
 from msmpetsc.study.table import as_table, failed, swept
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the study and write its report; return the exit status."""
-    if args.export_steps and not args.export:
-        raise InputError("--export-steps chooses steps of --export DIR, which is missing")
-    if args.export:
-        for written in export_systems(args.study, args.export, args.export_steps, args.full):
-            print(written)
-        return 0
     part = part_of(args.part)
     folder = args.output or Path("out") / args.study.stem
     if folder.exists() and not folder.is_dir():

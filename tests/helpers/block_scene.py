@@ -17,7 +17,25 @@ CELL = 1 / 8
 SIDES = np.array([0.5, 0.5, 0.25])
 YOUNG, DENSITY, G = 1e5, 1000.0, 9.81
 GRAVITY = {"acceleration": [0, 0, -G]}
-GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty"}
+
+
+def plane_at(height: float = 0.0, up: int = 1, **more) -> dict:
+    """Return the table of a plane across z, an obstacle; -1 if bodies lie below it."""
+    return {"shape": "plane", "point": [0, 0, height], "normal": [0, 0, up]} | more
+
+
+def box_at(bounds: list, **more) -> dict:
+    """Return the table of a box, an obstacle."""
+    return {"shape": "box", "box": bounds} | more
+
+
+def solid_of(young: float, poisson: float | None = None, **more) -> dict:
+    """Return the table of a neo-Hookean solid, of 1000 kg/m^3."""
+    given = {} if poisson is None else {"poisson_ratio": poisson}
+    return {"law": "neo-hookean", "young_modulus": young, "density": DENSITY} | given | more
+
+
+GROUND = plane_at(response="penalty")
 ROUGH_GROUND = GROUND | {"friction": 0.5}
 # stiffness of an edge inside the block (lattice.material)
 STIFFEST = 4 / 7 * YOUNG * CELL
@@ -39,6 +57,13 @@ def roller(axis: int, at: float = EPS, normal: int = -1) -> dict:
 CLAMP = {"region": half_space(0)}
 
 
+def write_scene(folder: Path, name: str = "scene", **tables) -> Path:
+    """Write the scene file of these tables."""
+    path = folder / f"{name}.toml"
+    path.write_text(tomli_w.dumps(tables))
+    return path
+
+
 def block_scene(folder: Path, sides: np.ndarray = SIDES, name: str = "scene", **tables) -> Path:
     """A scene file of a block with a corner at the origin; ``tables`` are added to it, or take a
     table's place.
@@ -55,9 +80,12 @@ def block_scene(folder: Path, sides: np.ndarray = SIDES, name: str = "scene", **
     }
     scene |= tables
     scene["material"] = {"law": "linear"} | scene["material"]
-    path = folder / f"{name}.toml"
-    path.write_text(tomli_w.dumps(scene))
-    return path
+    return write_scene(folder, name, **scene)
+
+
+def model_of(path: Path, *changes: str) -> Model:
+    """Return the model of a scene on a single rank."""
+    return build_model(MPI.COMM_SELF, load_scene(path, changes))
 
 
 def clamped_beam(folder: Path, **tables) -> Path:
@@ -66,9 +94,13 @@ def clamped_beam(folder: Path, **tables) -> Path:
     return block_scene(folder, np.array([1.0, 0.25, 0.25]), **swings | tables)
 
 
-def play(path: Path, *overrides: str) -> tuple[Model, list[Frame]]:
+def loop_of(path: Path, *changes: str, **more) -> TimeLoop:
+    """Return the steps of a scene on a single rank, none of them taken."""
+    scene = load_scene(path, changes)
+    return TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene), **more)
+
+
+def play(path: Path, *changes: str) -> tuple[Model, list[Frame]]:
     """Return the model and the frames of a scene on a single rank."""
-    scene = load_scene(path, overrides)
-    model = build_model(MPI.COMM_SELF, scene)
-    with TimeLoop(MPI.COMM_SELF, scene, model) as simulation:
-        return model, list(simulation.frames())
+    with loop_of(path, *changes) as simulation:
+        return simulation.model, list(simulation.frames())

@@ -1,8 +1,14 @@
 """Whether a surface crosses itself: each edge against each triangle, by signs of volumes, without
 any library of contact."""
 
+from collections.abc import Sequence
+
 import numba
 import numpy as np
+import trimesh
+
+from msmpetsc.build import Model
+from msmpetsc.fields import Frame
 
 
 def unique_edges(triangles: np.ndarray) -> np.ndarray:
@@ -24,6 +30,17 @@ def count_crossings(points: np.ndarray, triangles: np.ndarray) -> int:
         unique_edges(triangles),
         np.ascontiguousarray(triangles),
     )
+
+
+def crossings(model: Model, frames: Sequence[Frame], *solids: trimesh.Trimesh) -> int:
+    """Return how many edges cross triangles, of bodies and of solids at rest, over these frames."""
+    assert model.surface is not None
+    triangles, first = [model.surface.triangles], len(model.surface.points)
+    for solid in solids:
+        triangles.append(solid.faces + first)
+        first += len(solid.vertices)
+    still, of_all = [solid.vertices for solid in solids], np.concatenate(triangles)
+    return sum(count_crossings(np.concatenate([frame.surface, *still]), of_all) for frame in frames)
 
 
 @numba.njit(cache=True)

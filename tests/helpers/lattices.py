@@ -73,37 +73,30 @@ def dense_hessian(elasticity: Elasticity, q: np.ndarray, projected: bool = False
 
 def one_spring(m: float, k: float, r: float) -> Lattice:
     """A mass on a spring along z from a pinned end."""
-    return Lattice(
-        table=SortedKeys(COMM, np.arange(2)),
-        cell_size=r,
-        nodes=np.array([[0.0, 0, 0], [0, 0, r]]),
-        ghosts=np.empty(0, np.int64),
-        mass=np.full(2, m),
-        cells=np.empty((0, 8), np.int64),
-        cell_kind=np.empty(0, np.uint8),
-        springs=np.array([[0, 1]]),
-        springs_owned=1,
-        rest_length=np.array([r]),
-        stiffness=np.array([k]),
-        fixed=np.array([[True] * 3, [False] * 3]),
-    )
+    return _in_line(r, m, k, r, [True, False])
 
 
 def chain(m: float, k: float, r: float) -> Lattice:
     """Masses 1 apart along z, joined by springs of rest length r, the first and the last of the
     four pinned."""
-    count = 4
+    return _in_line(1.0, m, k, r, [True, False, False, True])
+
+
+def _in_line(apart: float, m: float, k: float, r: float, pinned: list[bool]) -> Lattice:
+    """Masses along z, each joined to the next."""
+    numbers = np.arange(len(pinned))
+    count = len(pinned) - 1
     return Lattice(
-        table=SortedKeys(COMM, np.arange(count)),
-        cell_size=1.0,
-        nodes=np.arange(count)[:, None] * np.array([0.0, 0, 1]),
+        table=SortedKeys(COMM, numbers),
+        cell_size=apart,
+        nodes=numbers[:, None] * np.array([0.0, 0, apart]),
         ghosts=np.empty(0, np.int64),
-        mass=np.full(count, m),
+        mass=np.full(len(pinned), m),
         cells=np.empty((0, 8), np.int64),
         cell_kind=np.empty(0, np.uint8),
-        springs=np.array([[0, 1], [1, 2], [2, 3]]),
-        springs_owned=count - 1,
-        rest_length=np.full(count - 1, r),
-        stiffness=np.full(count - 1, k),
-        fixed=np.repeat(np.arange(count) % (count - 1) == 0, 3).reshape(-1, 3),
+        springs=np.column_stack([numbers[:-1], numbers[1:]]),
+        springs_owned=count,
+        rest_length=np.full(count, r),
+        stiffness=np.full(count, k),
+        fixed=np.repeat(np.array(pinned)[:, None], 3, axis=1),
     )

@@ -75,11 +75,16 @@ def assert_one_line(done: subprocess.CompletedProcess, status: int, *words: str)
     assert not [noise for noise in NOISE if noise in told], told
 
 
+def status_of(*arguments: object) -> int:
+    """Return the exit status of a command, carried out in this process."""
+    return main([*map(str, arguments)])
+
+
 def command_error(*arguments: object) -> str:
     """Return the line of error with which a command ends, status 2. Notes may precede it."""
     stream = io.StringIO()
     with contextlib.redirect_stderr(stream):
-        status = main([*map(str, arguments)])
+        status = status_of(*arguments)
     (line,) = (
         line
         for line in stream.getvalue().splitlines()

@@ -5,18 +5,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from block_scene import EPS, SIDES, block_scene, half_space, play, roller
-from conftest import result_on
-from mpi4py import MPI
+from block_scene import EPS, SIDES, block_scene, half_space, model_of, play, roller, solid_of
+from obj_files import write_obj
 from one_process import command_error
 
-from msmpetsc.build import build_model
 from msmpetsc.elasticity.pressure import Pressures
-from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.simulate import TimeLoop
 
 YOUNG, NU = 1e5, 0.3
-SOLID = {"young_modulus": YOUNG, "density": 1000.0, "law": "neo-hookean", "poisson_ratio": NU}
+SOLID = solid_of(YOUNG, NU)
 STATIC = {"integrator": "static"}
 ALL = {"box": [[0, 0, 0], [1, 1, 1]], "relative": True}
 END = half_space(0, 1 - EPS, 1)
@@ -45,39 +41,6 @@ def test_a_traction_has_resultant_moment_and_stretch_of_a_bar(tmp_path: Path):
     assert moved @ share[:, 0] * 16 == pytest.approx(strain, rel=2e-3)
 
 
-def hollow(folder: Path, cell: float) -> np.ndarray:
-    """Return the displacements at the inside and outside of a hollow sphere, relative to Lame's."""
-    outer, inner = (trimesh.creation.icosphere(subdivisions=3, radius=r) for r in (1.0, 0.5))
-    inner.invert()
-    trimesh.util.concatenate([outer, inner]).export(folder / "hollow.ply")
-    places = [([0.75, 0, 0], ["y", "z"]), ([0, 0.75, 0], ["x", "z"]), ([0, 0, 0.75], ["x", "y"])]
-    pins = [{"region": {"sphere": {"center": x, "radius": 0.12}}, "fix": c} for x, c in places]
-    scene = block_scene(
-        folder, mesh={"source": "hollow.ply"}, cages={"cell_size": cell}, material=SOLID, pin=pins,
-        time=STATIC, solver={"error": 1e-6}, output={"surface": True},
-        pressure=[{"region": {"sphere": {"center": [0, 0, 0], "radius": 0.75}}, "value": 100.0}],
-    )  # fmt: skip
-    model, frames = play(scene)
-    assert model.surface is not None
-    x = model.surface.points
-    radius = np.linalg.norm(x, axis=1)
-    out = ((frames[-1].surface - x) * x).sum(axis=1) / radius
-    exact = 100 / YOUNG / 7 * ((1 - 2 * NU) * radius + (1 + NU) / (2 * radius**2))
-    is_inner = radius < 0.75
-    within, outside = ((out / exact)[part].mean() for part in (is_inner, ~is_inner))
-    np.testing.assert_allclose(frames[-1].surface_load, 0, atol=1e-10)
-    # -p V of the cavity, which grows by its area times the displacement
-    area = trimesh.creation.icosphere(subdivisions=3, radius=0.5).area
-    assert frames[-1].potential == pytest.approx(-100 * area * out[is_inner].mean(), rel=0.06)
-    return np.abs([within - 1, outside - 1])
-
-
-def test_a_hollow_sphere_grows_as_lame_says(tmp_path: Path):
-    """By its own law at 1e-3 of Young's modulus; the shell is 2.5 and 5 cells thick."""
-    coarse, fine = hollow(tmp_path, 0.2), hollow(tmp_path, 0.1)
-    assert coarse.max() < 0.04 and fine.max() < 0.02 and (fine < coarse).all()
-
-
 def pressed_block(folder: Path, **tables) -> Path:
     return block_scene(
         folder, material=SOLID,
@@ -87,7 +50,7 @@ def pressed_block(folder: Path, **tables) -> Path:
 
 
 def test_a_closed_pressure_has_the_potential_p_times_volume(tmp_path: Path):
-    model = build_model(MPI.COMM_SELF, load_scene(pressed_block(tmp_path)))
+    model = model_of(pressed_block(tmp_path))
     (part,), rest = model.lattice.pressed, model.lattice.nodes
     law, rng = Pressures([part], [3e3]), np.random.default_rng(1)
     base, q = (rest + 0.02 * rng.standard_normal(rest.shape) for _ in range(2))
@@ -179,33 +142,6 @@ def test_a_half_takes_the_pressure_of_the_whole(tmp_path: Path):
     assert plane[1] < -300 and (plane[[0, 2]] == 0).all()
 
 
-def test_ranks_agree_and_a_run_resumes(tmp_path: Path):
-    value = {"times": [0, 0.2], "values": [1e3, 5e3]}
-    traction = {"region": {"half_space": {"point": [0.49, 0, 0], "normal": [1, 0, 0]}}}
-    scene = pressed_block(
-        tmp_path, time={"step": 0.01, "duration": 0.22, "integrator": "bdf2"}, pin=[CORNER[0]],
-        pressure=[{"region": ALL, "value": value, "start": 0.02}],
-        traction=[traction | {"value": [0, 0, 50], "stop": 0.1}],
-    )  # fmt: skip
-    one, three = (result_on(ranks, scene) for ranks in (1, 3))
-    for name in ("position", "reaction", "surface_load", "load"):
-        a, b = one[f"frames/{name}"][:], three[f"frames/{name}"][:]
-        np.testing.assert_allclose(a, b, atol=1e-7 * np.abs(a).max(), err_msg=name)
-    loads = one["frames/surface_load"][:, 0]
-    np.testing.assert_allclose(loads[[1, 9], 2], 50 * 0.125, rtol=1e-12)
-    assert (loads[10:] == 0).all()
-    loaded = load_scene(scene)
-    model = build_model(MPI.COMM_SELF, loaded)
-    with TimeLoop(MPI.COMM_SELF, loaded, model) as simulation:
-        *_, last = simulation.frames()
-        saved = simulation.saved
-    with TimeLoop(MPI.COMM_SELF, loaded, model) as simulation:
-        simulation.restore(saved)
-        *_, again = simulation.frames()
-    assert saved.step == 20
-    np.testing.assert_array_equal(again.position, last.position)
-
-
 @pytest.mark.parametrize(
     ("kind", "table", "message"),
     [
@@ -240,10 +176,7 @@ def test_a_group_has_its_own_triangles(tmp_path: Path):
     """The group of an OBJ is the end of a block."""
     box = trimesh.creation.box(bounds=[[0, 0, 0], SIDES])
     is_end = np.isclose(box.triangles_center[:, 0], SIDES[0])
-    lines = [f"v {x} {y} {z}" for x, y, z in box.vertices]
-    for name, where in (("rest", ~is_end), ("end", is_end)):
-        lines += [f"g {name}", *(f"f {a} {b} {c}" for a, b, c in 1 + box.faces[where])]
-    (tmp_path / "grouped.obj").write_text("\n".join(lines))
+    write_obj(tmp_path / "grouped.obj", box, {"rest": ~is_end, "end": is_end})
     scene = block_scene(
         tmp_path, mesh={"source": "grouped.obj"}, material=SOLID, pin=CORNER, time=STATIC,
         traction=[{"region": {"group": "end"}, "value": [10, 0, 0]}],
@@ -255,8 +188,8 @@ def test_a_group_has_its_own_triangles(tmp_path: Path):
     message = "traction.0.region.group: the mesh has no group 'and'"
     assert message in command_error("run", scene, "--set", 'traction.0.region.group="and"')
     # a part that mesh.prepare drops
-    away = ["v 3 3 3", "v 3.1 3 3", "v 3 3.1 3", "g away", "f 9 10 11"]
-    (tmp_path / "grouped.obj").write_text("\n".join(lines + away))
+    with (tmp_path / "grouped.obj").open("a") as file:
+        file.write("v 3 3 3\nv 3.1 3 3\nv 3 3.1 3\ng away\nf 9 10 11\n")
     prepared = 'mesh.prepare=["largest_part"]', 'traction.0.region.group="away"'
     said = command_error("run", scene, "--set", prepared[0], "--set", prepared[1])
     assert "traction.0.region: its triangles leave the cells" in said

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import clamped_beam, play
+from block_scene import clamped_beam, play, solid_of
 from lattices import COMM, block, cages_of, dense_hessian
 from scipy.spatial.transform import Rotation
 
@@ -311,7 +311,7 @@ def test_volumetric_energies_agree_at_small_strain_alone(volume: str):
 def test_a_folded_bar_comes_to_an_end_without_cells_inside_out(tmp_path: Path, volume: str):
     path = clamped_beam(
         tmp_path,
-        material={"young_modulus": 1e6, "density": 1000.0, "law": "neo-hookean", "volume": volume},
+        material=solid_of(1e6, volume=volume),
         start={"scale": [0.5, 1, -0.3]},
         time={"integrator": "static"},
     )

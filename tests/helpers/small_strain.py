@@ -1,7 +1,6 @@
-"""Bodies at small strain against elasticity: bars along the grid and askew, a wave, a ball.
+"""Bodies at small strain against elasticity: bars along the grid and askew.
 
-Static problems and eigenfrequencies use the Hessian of E at rest; the wave uses the program's own
-steps. All errors are relative.
+Static problems and eigenfrequencies use the Hessian of E at rest. All errors are relative.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -14,7 +13,6 @@ from scipy.linalg import expm
 from scipy.optimize import brentq
 from scipy.sparse import coo_array, csc_array, diags
 from scipy.sparse.linalg import LinearOperator, eigsh, splu
-from scipy.special import spherical_jn
 
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.geometry.cages import BodySurface, fill
@@ -237,7 +235,7 @@ def lattice_beam(across: int, poisson: float | None = SPRINGS) -> tuple[float, f
     return clamped.sag(BEAM * WIDTH), clamped.frequency()
 
 
-# ---- steps of the program: a compression wave in a bar
+# ---- steps of the program
 
 
 def steps(
@@ -256,50 +254,6 @@ def steps(
             yield q, before
     finally:
         stepper.destroy()
-
-
-# length of the bar and its two stations [cells]; the bar is two cells, WIDTH, wide
-BAR, STATIONS = 120, (30, 80)
-CELL = WIDTH / 2
-# speed of long waves in a thin bar [m/s]
-SPEED = np.sqrt(E / DENSITY)
-# standard deviation of the blow [s]
-PULSE = 5 * CELL / SPEED
-# strain of the pulse [-]; the speed changes by 0.17 of it
-STRAIN = 1e-4
-
-
-def struck_bar(courant: float, poisson: float | None = SPRINGS) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (T,) [s] and mean axial velocities (T, 2) [m/s] at the stations of a struck bar.
-
-    The blow at the end x = 0 is a Gaussian in time. The wave travels ``courant`` cells in a time
-    step. The times end before the echo arrives.
-    """
-    lattice = box((BAR, 2, 2), CELL, poisson)
-    t = courant * CELL / SPEED
-    section = np.rint(lattice.nodes[:, 0] / CELL)
-    force = np.zeros_like(lattice.nodes)
-    end = section == 0
-    force[end, 0] = STRAIN * E * WIDTH**2 * lattice.mass[end] / lattice.mass[end].sum()
-    times = t * np.arange(1, round((STATIONS[1] + 60) / courant))
-    blows = (np.exp(-0.5 * (time / PULSE - 5) ** 2) * force for time in times)
-    motion = steps(lattice, t, lattice.nodes, lattice.nodes, blows, error=1e-5)
-    return times, np.array(
-        [[(q - p)[section == s, 0].mean() / t for s in STATIONS] for q, p in motion]
-    )
-
-
-def wave_speeds(times: np.ndarray, v: np.ndarray) -> tuple[float, float, float]:
-    """Return the speed errors of a pulse's centre and peak, and the ratio of its heights."""
-    centre = times @ v / v.sum(axis=0)
-    peak = []
-    # vertex of the parabola through the three highest values
-    for column in v.T:
-        near = column.argmax() + np.arange(-1, 2)
-        a, b, _ = np.polyfit(times[near] - times[near[1]], column[near], 2)
-        peak.append(times[near[1]] - b / (2 * a))
-    centre_error, peak_error = np.diff(STATIONS) * CELL / np.diff([centre, peak])[:, 0] / SPEED - 1
-    return centre_error, peak_error, v[:, 1].max() / v[:, 0].max()
 
 
 # ---- bodies that do not lie along the grid
@@ -338,29 +292,3 @@ def bar_errors(
         for lattice in lattices
     ]
     return len(lattices[0].cells), *np.transpose(errors)
-
-
-def frequencies(lattice: Lattice, count: int) -> np.ndarray:
-    """Return the lowest frequencies [rad/s] above the six rigid motions."""
-    mass = np.repeat(lattice.mass, 3)
-    K = hessian(lattice)
-    # makes the singular K positive definite
-    shift = -1e-4 * E / (DENSITY * LENGTH**2)
-    inverse = LinearOperator(K.shape, factorise((K - shift * diags(mass)).tocsc()))
-    squares = eigsh(
-        K, k=6 + count, M=diags(mass), sigma=shift, OPinv=inverse, v0=np.ones(len(mass))
-    )[0]
-    return np.sqrt(np.sort(squares)[6:])
-
-
-def ball_error(h: float, kind: str) -> tuple[int, float, float]:
-    """Return the number of cells, and the errors of a ball's lowest frequency and mass.
-
-    Lamb (1882): the lowest five modes are torsional of degree 2, with j_2(x) = x j_3(x) and
-    x = omega R / c_s.
-    """
-    ball = trimesh.creation.icosphere(5, RADIUS)
-    root = brentq(lambda x: spherical_jn(2, x) - x * spherical_jn(3, x), 2, 3)
-    lattice = lattice_of(ball, h, *KINDS[kind], offset=(0.3, 0.7, 0.5))
-    exact = root * np.sqrt(SHEAR / DENSITY) / RADIUS
-    return len(lattice.cells), frequencies(lattice, 5).mean() / exact - 1, mass_error(lattice, ball)

@@ -102,18 +102,6 @@ def bent(length: int, across: int, poisson: float | None, load: float) -> Run:
     )
 
 
-def sag_error(across: int, poisson: float | None, length: int = 10) -> float:
-    """Return the error of a cantilever's tip deflection under a small load.
-
-    The reference is Timoshenko's beam with Cowper's (1966) shear coefficient.
-    """
-    nu = 0.25 if poisson is SPRINGS else poisson
-    load = 1e-5 * E
-    kappa = 10 * (1 + nu) / (12 + 11 * nu)
-    exact = load * (length**3 / (3 * E / 12) + length * 2 * (1 + nu) / (kappa * E))
-    return -bent(length, across, poisson, load).moved(length)[2] / exact - 1
-
-
 # length [m], tip displacement down and back in lengths; Bisshopp and Drucker (1945)
 LENGTH, DOWN, BACK = 20, 0.71379, 0.38763
 

@@ -1,17 +1,12 @@
-"""The material against elasticity: constants, a clamped beam, a wave, free flight, and scikit-fem's
-hexahedra."""
+"""The material against elasticity: constants, a clamped beam, free flight."""
 
 from functools import cache
 
-from lab import slope
-
 import numpy as np
 import pytest
-import skfem
 import small_strain as study
 from scipy.spatial.transform import Rotation
-from skfem.models.elasticity import lame_parameters, linear_elasticity
-from small_strain import ACROSS, BEAM, DENSITY, GRAVITY, NU, WIDTH, E, factorise, hessian
+from small_strain import ACROSS, hessian
 from strains import elastic_constant, uniform_strains
 
 from msmpetsc.elasticity.energy import Elasticity
@@ -47,22 +42,6 @@ def test_elastic_constants_in_every_direction(name: str, poisson: float | None):
 # ---- a clamped beam
 
 
-@cache
-def fem_sag(across: int, order: int = 1) -> float:
-    """Tip deflection [m] of the same beam of scikit-fem's hexahedra on the same grid: trilinear, or
-    of order 2."""
-    sides = [np.linspace(0, side * WIDTH, side * across + 1) for side in (BEAM, 1, 1)]
-    element = skfem.ElementVector({1: skfem.ElementHex1, 2: skfem.ElementHex2}[order]())
-    # exact for cubes
-    basis = skfem.Basis(skfem.MeshHex.init_tensor(*sides), element, intorder=2 * order + 1)
-    K = linear_elasticity(*lame_parameters(E, NU)).assemble(basis).tocsc()
-    f = skfem.LinearForm(lambda v, _: -DENSITY * GRAVITY * v[2]).assemble(basis)
-    free = basis.complement_dofs(basis.get_dofs(lambda x: np.isclose(x[0], 0)))
-    u = np.zeros(basis.N)
-    u[free] = factorise(K[free][:, free])(f[free])
-    return -u[basis.nodal_dofs[2, np.isclose(basis.mesh.p[0], BEAM * WIDTH)]].mean()
-
-
 @pytest.mark.parametrize("across", ACROSS)
 def test_the_excess_stiffness_is_that_of_cells_that_cannot_curve(across: int):
     """E I (1 + 169/140 (h/b)^2).
@@ -75,32 +54,7 @@ def test_the_excess_stiffness_is_that_of_cells_that_cannot_curve(across: int):
     assert 0 < frequency / study.timoshenko_frequency(across) - 1 < 0.0075
 
 
-def test_it_comes_to_the_solid_of_scikit_fem_with_second_order():
-    """Trilinear hexahedra on the same grid: their excess is 1/2 (h/b)^2, so the difference goes as
-    h^2."""
-    difference = [1 - lattice_beam(across)[0] / fem_sag(across) for across in ACROSS]
-    # (169/140 - 1/2) / 8^2 = 1.1%
-    assert 0 < difference[-1] < 0.013
-    assert 1.6 < slope(1 / np.array(ACROSS), difference) < 2.2
-    solid = fem_sag(2, order=2)
-    errors = [1 - lattice_beam(across)[0] / solid for across in ACROSS]
-    assert 1.6 < slope(1 / np.array(ACROSS), errors) < 2.2
-
-
 # ---- a wave, free flight
-
-
-@pytest.mark.parametrize(("poisson", "late"), [(None, -0.0024), (NU, -0.0028)], ids=study.LAWS)
-def test_a_compression_wave_runs_at_the_root_of_E_over_rho(poisson: float | None, late: float):
-    """Its centre to the strain, its peak as dispersion and implicit Euler move it, its height as
-    Euler damps it."""
-    centre, peak, height = study.wave_speeds(*study.struck_bar(1 / 4, poisson))
-    assert abs(centre) < study.STRAIN
-    # linear theory of springs: bar -0.11%, cells -0.18%, implicit Euler +0.05%
-    assert peak == pytest.approx(late, abs=1e-4)
-    # variance of the pulse [cells^2]
-    near, far = (5**2 + station / 4 for station in study.STATIONS)
-    assert height == pytest.approx(np.sqrt(near / far), rel=0.01)
 
 
 def free_flight(t: float, shake: float, error: float, poisson: float | None) -> tuple[float, float]:

@@ -2,18 +2,16 @@
 
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 import trimesh
-from block_scene import CELL, SIDES, G, block_scene, play
+from block_scene import CELL, SIDES, block_scene, loop_of, play
 from mpi4py import MPI
 from one_process import answers_on, refusal_in
 
 from msmpetsc.build import build_model, read_bodies
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.simulate import TimeLoop
 
 T = 0.01
 LEFT = {"box": [[0, 0, 0], [0.01, 0.5, 0.25]]}
@@ -109,9 +107,9 @@ def test_a_wrong_option_is_still_told_where_the_solver_was_built_again(
     tmp_path: Path, petsc_options
 ):
     """An option that the first solver used is not reported, nor removed with our defaults."""
-    scene = load_scene(anchored_scene(tmp_path, 3, [{"region": LEFT, "path": UP, "stop": 0.015}]))
+    scene = anchored_scene(tmp_path, 3, [{"region": LEFT, "path": UP, "stop": 0.015}])
     petsc_options(ksp_rtol="1e-8")
-    with TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
+    with loop_of(scene) as simulation:
         first = simulation.integrator.stepper
         assert len(list(simulation.frames())) == 4
         second = simulation.integrator.stepper
@@ -202,71 +200,10 @@ WRONG = {
 }
 
 
-# ---- on a single rank and on two, by the command line
-
-PRESETS = "newton", "anderson", "fast-msm"
-
-
-@pytest.fixture(scope="module")
-def runs(balls: Path) -> dict[int, tuple[Path, list]]:
-    """Return the folder of results, and each rank's status and output, by number of ranks."""
-    half, most_of_it = (
-        {"box": [[0, 0, 0], [0.5, 0.3, 0.25]]},
-        {"box": [[0, 0.3, 0], [0.4, 0.5, 0.25]]},
-    )
-    anchors = [
-        {"region": half, "path": UP, "stop": 0.025},
-        {"region": most_of_it, "path": UP, "stop": 0.045},
-    ]
-    prescribed = anchored_scene(balls, 6, anchors, name="led", gravity={"acceleration": [0, 0, -G]})
-    found = {}
-    for ranks in (1, 2):
-        out = balls / f"ranks{ranks}"
-        commands = [
-            [prescribed, "-o", out / f"{preset}.h5", "--preset", preset, "--error", "1e-10"]
-            for preset in PRESETS
-        ]
-        commands += [[balls / "scene.toml", "-o", out / "painted.h5"]]
-        for value in WRONG:
-            commands += [
-                [
-                    balls / "scene.toml",
-                    "-o",
-                    out / "wrong.h5",
-                    "--set",
-                    f"pin.0.region.painted={value}",
-                ]
-            ]
-        found[ranks] = (
-            out,
-            answers_on(ranks, [["run", *command, "-ksp_rtol", "1e-8"] for command in commands]),
-        )
-    return found
-
-
-@pytest.mark.parametrize("preset", PRESETS)
-def test_two_ranks_lead_and_let_go_as_one(runs: dict, preset: str):
-    """The solver is built three times.
-
-    At first six nodes of the last corner are free, so a rank has none.
-    """
-    files = {}
-    for ranks, (out, answers) in runs.items():
-        assert [status for status, _ in answers[PRESETS.index(preset)]] == [0] * ranks, answers
-        files[ranks] = h5py.File(out / f"{preset}.h5")["frames/position"][:]
-    assert np.linalg.norm(files[2] - files[1]) < 1e-8 * np.linalg.norm(files[1] - files[1][0])
-
-
-def test_two_ranks_find_the_same_painted_nodes(runs: dict):
-    one, two = (h5py.File(out / "painted.h5")["lattice/pinned"][:] for out, _ in runs.values())
-    assert len(one) > 8
-    np.testing.assert_array_equal(two, one)
-
-
-@pytest.mark.parametrize("ranks", [1, 2])
-def test_what_cannot_be_painted_is_told_in_one_line(runs: dict, ranks: int):
-    out, found = runs[ranks]
-    for words, answers in zip(WRONG.values(), found[-len(WRONG) :], strict=True):
+def test_what_cannot_be_painted_is_told_in_one_line_by_one_of_two_ranks(balls: Path):
+    words = ["run", balls / "scene.toml", "-o", balls / "wrong.h5", "--set"]
+    commands = [[*words, f"pin.0.region.painted={value}"] for value in WRONG]
+    for told, answers in zip(WRONG.values(), answers_on(2, commands), strict=True):
         line = refusal_in(answers)
-        assert all(word in line for word in words), line
-    assert not list(out.glob("wrong*"))
+        assert all(word in line for word in told), line
+    assert not list(balls.glob("wrong*"))

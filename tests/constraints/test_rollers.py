@@ -5,12 +5,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import CLAMP, EPS, SIDES, block_scene, half_space, play, roller
-from conftest import result_on
+from block_scene import (
+    CLAMP,
+    EPS,
+    GRAVITY,
+    SIDES,
+    block_scene,
+    box_at,
+    half_space,
+    plane_at,
+    play,
+    roller,
+    solid_of,
+)
 from one_process import command_error
 from scipy.optimize import fsolve
 
-SOLID = {"young_modulus": 1e5, "density": 1000.0, "law": "neo-hookean", "poisson_ratio": 0.3}
+SOLID = solid_of(1e5, 0.3)
 MU, LAMBDA = 1e5 / 2.6, 3e4 / (1.3 * 0.4)
 HALF = SIDES * [1, 0.5, 1]
 MULTIGRID = {"preset": "newton-multigrid", "error": 1e-10}
@@ -24,7 +35,7 @@ LIFT = {
     "stop": 0.03,
 }
 SYMMETRIC = {"pin": [CLAMP], "gravity": {"acceleration": [0.5, 0, -9.81]}, "material": SOLID}
-FLOOR = {"shape": "plane", "point": [0, 0, -0.002], "normal": [0, 0, 1]}
+FLOOR = plane_at(-0.002)
 CASES = {
     "static, multigrid": {"time": {"integrator": "static"}, "solver": MULTIGRID},
     "static, springs": {
@@ -64,8 +75,8 @@ def test_half_a_body_is_half_of_the_whole(tmp_path: Path, case: str):
         assert of_plane[1] != 0 and (of_plane[[0, 2]] == 0).all()
 
 
-FLOOR = {"shape": "plane", "point": [0, 0, -0.002], "normal": [0, 0, 1]}
-DROP = {"gravity": {"acceleration": [0, 0, -9.81]}, "start": {"velocity": [0.1, 0, -0.5]}}
+FLOOR = plane_at(-0.002)
+DROP = {"gravity": GRAVITY, "start": {"velocity": [0.1, 0, -0.5]}}
 MIDDLE = {"region": {"box": [[-1, 0.25 - EPS, -1], [1, 0.25 + EPS, 1]]}, "fix": ["y"]}
 
 
@@ -99,7 +110,7 @@ def test_a_plane_of_symmetry_needs_no_roller(tmp_path: Path, integrator: str, fl
 
 def test_forces_on_a_held_body_that_lies_on_a_barrier_add_up(tmp_path: Path):
     """A half on a floor: loads, reactions and pushes are the change of momentum."""
-    floor = {"shape": "box", "box": [[-1, -1, -0.2], [1, 2, -0.002]], "response": "barrier"}
+    floor = box_at([[-1, -1, -0.2], [1, 2, -0.002]], response="barrier")
     scene = block_scene(
         tmp_path, HALF, material=SOLID, pin=[roller(1, 0.25 - EPS, 1)], obstacle=[floor], **DROP,
         time={"step": 0.01, "duration": 0.04}, solver={"preset": "newton", "error": 1e-9},
@@ -174,16 +185,6 @@ def test_a_slab_between_walls_falls_freely(tmp_path: Path):
     exact = np.outer(fall, [1, 0, -9]) + np.outer(0.1 * steps, [0.5, 0, 0])
     np.testing.assert_allclose(moved, exact, atol=1e-9)
     assert (q[..., 1] == q[0, :, 1]).all()
-
-
-def test_ranks_agree(tmp_path: Path):
-    tables = SYMMETRIC | CASES["led, BDF2"]
-    pins = [CLAMP, roller(1, 0.25 - EPS, 1)]
-    scene = block_scene(tmp_path, HALF, **tables | {"pin": pins})
-    one, three = (result_on(ranks, scene) for ranks in (1, 3))
-    for name in ("position", "reaction", "torque"):
-        a, b = one[f"frames/{name}"][:], three[f"frames/{name}"][:]
-        np.testing.assert_allclose(a, b, atol=1e-8 * np.abs(a).max(), err_msg=name)
 
 
 ONCE = "pin.0.fix: must name one to three components, each once, got"

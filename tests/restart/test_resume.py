@@ -13,10 +13,10 @@ import h5py
 import numpy as np
 import pytest
 import tomli_w
-from block_scene import block_scene
+from block_scene import CELL, block_scene, box_at, half_space, plane_at, solid_of
 from conftest import WORKERS, run
 from mpi4py import MPI
-from one_process import command_error
+from one_process import command_error, status_of
 from stopped_runs import (  # noqa: F401  # a fixture
     STEPS,
     assert_goes_on_exactly,
@@ -29,27 +29,31 @@ from stopped_runs import (  # noqa: F401  # a fixture
 
 from msmpetsc.app.resume import Resumed
 from msmpetsc.build import build_model
-from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
 from msmpetsc.results.checkpoint_reader import Earlier
 from msmpetsc.results.untrusted_file import finished
 from msmpetsc.scene.reading import load_scene
+from msmpetsc.solve.multigrid import cycle
+from msmpetsc.solve.nonlinear import preconditioning
+from msmpetsc.solve.nonlinear.preconditioning import LatticePreconditioner
 from msmpetsc.solve.presets import PRESETS
 from msmpetsc.solve.simulate import TimeLoop
 
 COMM = MPI.COMM_SELF
+WORKER = WORKERS / "stop_worker.py"
 GRAVITY = {"acceleration": [0.0, 1.0, -9.81]}
 SIDE = [{"region": {"box": [[-0.01, -1.0, -1.0], [0.01, 1.0, 1.0]]}}]
 FAR = {"box": [[0.49, -1, -1], [0.51, 1, 1]]}
 LED = [{"region": FAR, "path": [{"time": 0.05, "by": [0.05, 0, 0.05]}], "stop": 0.08}]
 # the anchor is released later
 PUSHED = [{"region": {"box": [[0.24, -1, -1], [0.26, 1, 1]]}, "path": LED[0]["path"], "stop": 0.1}]
-GROUND = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1]}
+GROUND = plane_at()
 PRESSING = [
     GROUND | {"response": "penalty", "friction": 0.5, "path": [{"time": 1.0, "by": [0, 0, 0.3]}]}
 ]
+ALL = {"box": [[0, 0, 0], [1, 1, 1]], "relative": True}
 # thinner than the way of a step
-THIN = {"shape": "box", "box": [[-2, -2, -0.001], [2, 2, 0]]}
+THIN = box_at([[-2, -2, -0.001], [2, 2, 0]])
 SOFT = {"young_modulus": 1e4, "density": 1000.0}
 
 
@@ -87,6 +91,12 @@ def solver(preset: str) -> dict:
 
 
 LOOSE = solver("newton")
+SURFACE_LOADS = {
+    "pressure": [
+        {"region": ALL, "value": {"times": [0, 0.2], "values": [1e3, 5e3]}, "start": 0.02}
+    ],
+    "traction": [{"region": half_space(0, 0.49, 1), "value": [0, 0, 50], "stop": 0.1}],
+}
 CASES = {
     **{
         f"{preset}, {name}": fall(solver=solver(preset), obstacle=obstacle)
@@ -104,6 +114,7 @@ CASES = {
     ),
     "anchor": swing(solver=LOOSE, anchor=LED, output={"surface": False, "every": 3}),
     "bdf2": by("bdf2", swing(solver=LOOSE)),
+    "bdf2, surface loads": by("bdf2", swing(solver=LOOSE, **SURFACE_LOADS)),
     "static": by("static", swing(solver=LOOSE, anchor=[LED[0] | {"stop": 0.05}, *PUSHED])),
     "bdf2, pressed": by("bdf2", fall(solver=LOOSE, obstacle=PRESSING)),
     "a thin plate": fall(solver=LOOSE, obstacle=[THIN | {"response": "penalty", "friction": 0.5}]),
@@ -139,6 +150,47 @@ def test_a_step_from_a_checkpoint_is_the_step_of_the_whole_run(tmp_path, case):
         assert sum(frame.substeps + frame.fallbacks for frame in frames) > 0
 
 
+BLOCK = {
+    "sides": np.array([6, 3, 3]) * CELL,
+    "material": {"young_modulus": 1e5, "density": 1000.0},
+    "time": {"step": 0.02, "duration": 0.2},
+    "solver": solver("newton-multigrid"),
+}
+TIP = {"box": [[0.74, -1, -1], [0.76, 1, 1]]}
+TIP_LED = [{"region": TIP, "path": [{"time": 0.08, "by": [0.05, 0, 0.05]}], "stop": 0.1}]
+# the places where hierarchies are built
+MULTIGRID = {
+    "solid, pressed": fall(**BLOCK | {"material": solid_of(1e5)}, obstacle=PRESSING),
+    "bdf2, pressed": by("bdf2", fall(**BLOCK, obstacle=PRESSING)),
+    "led and let go": swing(**BLOCK, anchor=TIP_LED),
+    "fallback": fall(
+        **BLOCK | {"solver": {"preset": "fast-msm", "error": 1e-6}},
+        start={"velocity": [0.1, 0, -10.0]},
+        safety={"on_failure": "fallback"},
+        obstacle=PRESSING,
+    ),
+}
+# each case takes some five seconds
+QUICK = {"solid, pressed", "fallback"}
+
+
+@pytest.mark.parametrize(
+    "case",
+    [case if case in QUICK else pytest.param(case, marks=pytest.mark.slow) for case in MULTIGRID],
+)
+def test_the_hierarchy_of_then_is_built_again(tmp_path, case: str, monkeypatch):
+    """In runs that build hierarchies in some steps only: of several levels, given up soon."""
+    monkeypatch.setattr(cycle, "COARSEST", 10)
+    monkeypatch.setattr(preconditioning, "WORTH", 1.0)
+    built, build = [], LatticePreconditioner._build
+    monkeypatch.setattr(
+        LatticePreconditioner, "_build", lambda *given: (built.append(1), build(*given))[1]
+    )
+    frames = assert_goes_on_exactly(block_scene(tmp_path, **MULTIGRID[case]), every=3)
+    assert len(built) > 1
+    assert case != "fallback" or sum(frame.fallbacks for frame in frames) > 0
+
+
 def test_a_checkpoint_has_no_more_than_the_run_needs(tmp_path):
     def rows(scene: dict) -> set[str]:
         read = load_scene(block_scene(tmp_path, **scene))
@@ -156,34 +208,44 @@ def test_a_checkpoint_has_no_more_than_the_run_needs(tmp_path):
     assert rows(by("verlet", fall(obstacle=[THIN]))) == {"sides"}
 
 
+LONGER = "--set", "time.duration=0.56"
+
+
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Never stopped; every third step also solved to rounding."""
     folder = tmp_path_factory.mktemp("whole")
-    assert (
-        main(["run", str(hanging(folder)), "-o", str(folder / "whole.h5"), "--true-error", "3"])
-        == 0
-    )
+    assert status_of("run", hanging(folder), "-o", folder / "whole.h5", "--true-error", 3) == 0
     return folder / "whole.h5"
 
 
-@pytest.fixture
-def stopped(whole: Path, tmp_path, monkeypatch: pytest.MonkeyPatch) -> Path:
+@pytest.fixture(scope="module")
+def longer(whole: Path) -> Path:
+    """The same of 56 steps."""
+    words = "-o", whole.with_name("longer.h5"), "--true-error", 3, *LONGER
+    assert status_of("run", whole.with_name("scene.toml"), *words) == 0
+    return whole.with_name("longer.h5")
+
+
+@pytest.fixture(scope="module")
+def after_ten(whole: Path) -> Path:
     """The same, stopped after ten steps."""
-    path = tmp_path / "stopped.h5"
-    with monkeypatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch:
         signal_after(patch, 10, signal.SIGUSR1)
-        assert (
-            main(["run", str(whole.parent / "scene.toml"), "-o", str(path), "--true-error", "3"])
-            == 0
-        )
-    return path
+        words = "-o", whole.with_name("stopped.h5"), "--true-error", 3
+        assert status_of("run", whole.with_name("scene.toml"), *words) == 0
+    return whole.with_name("stopped.h5")
+
+
+@pytest.fixture
+def stopped(after_ten: Path, tmp_path) -> Path:
+    return Path(shutil.copy(after_ten, tmp_path))
 
 
 def test_what_was_asked_for_beside_the_frames_is_there_after_going_on(whole: Path, stopped: Path):
     cost, picture = stopped.with_suffix(".json"), stopped.with_suffix(".png")
     pytest.importorskip("pyvista")
-    assert main(["run", "--resume", str(stopped), "--measure", str(cost), "--picture"]) == 0
+    assert status_of("run", "--resume", stopped, "--measure", cost, "--picture") == 0
     # the true errors are equal, too
     assert_same(stopped, whole)
     assert json.loads(cost.read_text())["time"]["stepping"] > 0 and picture.stat().st_size > 1000
@@ -199,13 +261,13 @@ def test_frames_after_the_checkpoint_are_kept_as_they_are(whole: Path, tmp_path,
 
     with monkeypatch.context() as patch:
         at_step(patch, 21, killed)
-        arguments = ["-o", str(path), "--true-error", "3", "--checkpoint-every", "1000"]
-        assert main(["run", str(whole.parent / "scene.toml"), *arguments]) == 1
+        arguments = ["-o", path, "--true-error", 3, "--checkpoint-every", 1000]
+        assert status_of("run", whole.with_name("scene.toml"), *arguments) == 1
     with h5py.File(path) as file:
         assert max(file["checkpoint/step"]) == 0 and finished(file) == 8
         times = file["frames/wall_time"][:]
     # the trimmed file is written anew
-    assert main(["run", "--resume", str(path)]) == 0
+    assert status_of("run", "--resume", path) == 0
     assert_same(path, whole)
     with h5py.File(path) as file:
         assert np.array_equal(file["frames/wall_time"][:8], times)
@@ -217,9 +279,7 @@ def test_frames_after_the_checkpoint_are_kept_as_they_are(whole: Path, tmp_path,
 def test_checkpoints_come_as_often_as_asked_and_at_the_end(whole: Path, tmp_path, every, steps):
     path = tmp_path / "x.h5"
     assert (
-        main(
-            ["run", str(whole.parent / "scene.toml"), "-o", str(path), "--checkpoint-every", every]
-        )
+        status_of("run", whole.with_name("scene.toml"), "-o", path, "--checkpoint-every", every)
         == 0
     )
     with h5py.File(path) as file:
@@ -228,7 +288,7 @@ def test_checkpoints_come_as_often_as_asked_and_at_the_end(whole: Path, tmp_path
 
 def test_nothing_is_left_to_do(whole: Path, capsys):
     before = whole.read_bytes()
-    assert main(["run", "--resume", str(whole)]) == 0
+    assert status_of("run", "--resume", whole) == 0
     assert "nothing left to do" in capsys.readouterr().err
     assert whole.read_bytes() == before
 
@@ -237,7 +297,7 @@ def test_another_scene_is_refused_with_its_keys(stopped: Path, capsys):
     scene = Path(h5py.File(stopped).attrs["scene_file"])
     before = stopped.read_bytes()
     given = ["--set", "time.duration=0.8", "--set", "material.density=900", "--preset", "anderson"]
-    assert main(["run", str(scene), "--resume", str(stopped), *given]) == 2
+    assert status_of("run", scene, "--resume", stopped, *given) == 2
     told = capsys.readouterr().err
     for key, earlier in (
         ("time.duration", 0.4),
@@ -245,13 +305,13 @@ def test_another_scene_is_refused_with_its_keys(stopped: Path, capsys):
         ("solver.preset", "newton"),
     ):
         assert f"{key}: {earlier} in {stopped}" in told
-    assert main(["run", "--resume", str(stopped), "--set", "time.step=0.005", "--force"]) == 2
+    assert status_of("run", "--resume", stopped, "--set", "time.step=0.005", "--force") == 2
     assert "time.step: 0.01 in" in capsys.readouterr().err
     assert stopped.read_bytes() == before
 
 
 def test_other_options_of_petsc_are_refused_unless_they_only_tell(whole: Path):
-    earlier, scene = Earlier.read(whole), load_scene(whole.parent / "scene.toml")
+    earlier, scene = Earlier.read(whole), load_scene(whole.with_name("scene.toml"))
     with pytest.raises(InputError, match=r"-ksp_rtol: none in .*whole\.h5, 1e-2 now"):
         Resumed(earlier, scene, {"ksp_rtol": "1e-2"}, force=False)
     silent = {"log_view": "", "snes_monitor": "", "use_gpu_aware_mpi": "0"}
@@ -259,23 +319,13 @@ def test_other_options_of_petsc_are_refused_unless_they_only_tell(whole: Path):
     assert Resumed(earlier, scene, {"ksp_rtol": "1e-2"}, force=True).is_done
 
 
-def test_a_longer_run(whole: Path, stopped: Path, tmp_path):
+def test_a_longer_run(whole: Path, stopped: Path, longer: Path, tmp_path):
     """A longer run from a stopped and from a finished file.
 
     The 40th step had a frame as the last step; now it has none.
     """
-    longer = tmp_path / "longer.h5"
-    more = ["--set", "time.duration=0.56"]
-    assert (
-        main(
-            ["run", str(whole.parent / "scene.toml"), "-o", str(longer), *more, "--true-error", "3"]
-        )
-        == 0
-    )
-    done = tmp_path / "done.h5"
-    done.write_bytes(whole.read_bytes())
-    for path in (stopped, done):
-        assert main(["run", "--resume", str(path), *more, "--force"]) == 0
+    for path in (stopped, shutil.copy(whole, tmp_path)):
+        assert status_of("run", "--resume", path, *LONGER, "--force") == 0
         assert_same(path, longer)
         with h5py.File(path) as file:
             assert tomllib.loads(file.attrs["scene"])["time"]["duration"] == 0.56
@@ -285,52 +335,41 @@ def test_a_longer_run(whole: Path, stopped: Path, tmp_path):
 
 
 def left_by_a_kill(
-    monkeypatch: pytest.MonkeyPatch, step: int, path: Path, arguments: list[str]
+    monkeypatch: pytest.MonkeyPatch, step: int, path: Path, *arguments: object
 ) -> None:
     """The run's file as a kill after that step would leave it."""
     left: list[bytes] = []
     with monkeypatch.context() as patch:
         at_step(patch, step, lambda: left.append(path.read_bytes()))
-        assert main(arguments) == 0
+        assert status_of(*arguments) == 0
     path.write_bytes(left[0])
 
 
 @pytest.mark.parametrize("killed", [11, 13, 25])
 def test_a_longer_run_after_a_stop_between_frames_and_a_kill(
-    whole: Path, stopped: Path, tmp_path, monkeypatch, killed
+    stopped: Path, longer: Path, monkeypatch, killed
 ):
     """The effort since the frame before the checkpoint counts, whatever frames came after it."""
-    longer, more = tmp_path / "longer.h5", ["--set", "time.duration=0.56"]
-    left_by_a_kill(
-        monkeypatch,
-        killed,
-        stopped,
-        ["run", "--resume", str(stopped), "--checkpoint-every", "1000"],
-    )
+    words = "run", "--resume", stopped, "--checkpoint-every", 1000
+    left_by_a_kill(monkeypatch, killed, stopped, *words)
     with h5py.File(stopped) as file:
         assert max(file["checkpoint/step"]) == 10 and finished(file) == 1 + killed // 3
-    assert main(["run", "--resume", str(stopped), *more, "--force"]) == 0
-    assert (
-        main(
-            ["run", str(whole.parent / "scene.toml"), "-o", str(longer), *more, "--true-error", "3"]
-        )
-        == 0
-    )
+    assert status_of("run", "--resume", stopped, *LONGER, "--force") == 0
     assert_same(stopped, longer)
 
 
 def test_numbers_of_another_version_are_not_written_over(stopped: Path, capsys):
     with h5py.File(stopped, "r+") as file:
         file["checkpoint/numbers"].attrs["names"] += "_of_old"
-    assert main(["run", "--resume", str(stopped)]) == 2
+    assert status_of("run", "--resume", stopped) == 2
     assert "has no room for checkpoint/numbers as it is now: --force" in capsys.readouterr().err
 
 
 def test_a_run_cannot_end_before_its_checkpoint(stopped: Path, capsys):
     before = stopped.read_bytes()
     for duration, steps in ((0.1, 10), (0.096, 10), (0.094, 9)):
-        status = main(
-            ["run", "--resume", str(stopped), "--set", f"time.duration={duration}", "--force"]
+        status = status_of(
+            "run", "--resume", stopped, "--set", f"time.duration={duration}", "--force"
         )
         told = capsys.readouterr().err
         assert (status, "damaged" in told) == ((2, False) if steps == 10 else (0, False)), told
@@ -346,13 +385,13 @@ def test_another_start_takes_no_frame_of_before_the_first_checkpoint(
 ):
     """Killed between frame 0 and the first checkpoint."""
     path, other = tmp_path / "x.h5", ["--set", "start.velocity=[1.0, 0.0, 0.0]"]
-    scene = str(whole.parent / "scene.toml")
-    left_by_a_kill(monkeypatch, 0, path, ["run", scene, "-o", str(path), "--frames", "3"])
+    scene = whole.with_name("scene.toml")
+    left_by_a_kill(monkeypatch, 0, path, "run", scene, "-o", path, "--frames", 3)
     with h5py.File(path, "r+") as file:
         file["checkpoint/step"][...] = -1
         assert finished(file) == 1
-    assert main(["run", "--resume", str(path), *other, "--force"]) == 0
-    assert main(["run", scene, "-o", str(tmp_path / "other.h5"), "--frames", "3", *other]) == 0
+    assert status_of("run", "--resume", path, *other, "--force") == 0
+    assert status_of("run", scene, "-o", tmp_path / "other.h5", "--frames", "3", *other) == 0
     assert_same(path, tmp_path / "other.h5")
 
 
@@ -378,7 +417,7 @@ def test_positions_that_no_frame_knows_are_refused(
     path = tmp_path / "x.h5"
     with monkeypatch.context() as patch:
         signal_after(patch, step, signal.SIGUSR1)
-        main(["run", str(whole.parent / "scene.toml"), "-o", str(path)])
+        status_of("run", whole.with_name("scene.toml"), "-o", path)
     with h5py.File(path, "r+") as file:
         assert max(file["checkpoint/step"]) == step
         file[f"checkpoint/{name}"][...] = value
@@ -396,13 +435,13 @@ def test_a_file_cannot_name_meshes_of_another_folder(
     shutil.copy(whole.parent / "scene.ply", other / "scene.ply")
     if lies_there != "mesh":
         shutil.copy(other / "scene.ply", other / "its.ply")
-        text = (whole.parent / "scene.toml").read_text()
+        text = (whole.with_name("scene.toml")).read_text()
         (other / "scene.toml").write_text(text.replace("scene.ply", "its.ply"))
     with h5py.File(stopped, "r+") as file:
         file.attrs["scene_file"] = str(other / "scene.toml")
     for force in ([], ["--force"]):
         assert "name the SCENE too" in command_error("run", "--resume", stopped, *force)
-    assert main(["run", str(whole.parent / "scene.toml"), "--resume", str(stopped)]) == 0
+    assert status_of("run", whole.with_name("scene.toml"), "--resume", stopped) == 0
 
 
 @pytest.mark.parametrize(
@@ -416,7 +455,7 @@ def test_a_file_cannot_make_a_run_do_more_than_solve(
     with h5py.File(stopped, "r+") as file:
         file.attrs["petsc_options"] = option
     if option.startswith("-log_view"):
-        assert main(["run", "--resume", str(stopped)]) == 0 and not list(tmp_path.glob("x*"))
+        assert status_of("run", "--resume", stopped) == 0 and not list(tmp_path.glob("x*"))
     else:
         assert "is not taken from a file" in command_error("run", "--resume", stopped)
 
@@ -439,7 +478,7 @@ def test_a_file_that_is_being_written_is_left_alone(stopped: Path):
     assert "is being written by another run" in command_error("run", "--resume", stopped)
     done.set()
     other.join()
-    assert main(["run", "--resume", str(stopped)]) == 0
+    assert status_of("run", "--resume", stopped) == 0
 
 
 def take_and_free(path: Path, times: int, twice) -> None:
@@ -481,14 +520,29 @@ def test_what_cannot_be_resumed_is_told(given, monkeypatch, tmp_path):
     assert command_error("run", *given)
 
 
+def stopped_and_whole(ranks: int, step: int, scene: Path, *words: object) -> list[Path]:
+    """Return the results of a run that is stopped after a step, and of the whole run."""
+    paths = [scene.with_name("x.h5"), scene.with_name("whole.h5")]
+    for at, path in zip((step, -1), paths, strict=True):
+        run(ranks, WORKER, at, "run", scene, "-o", path, *words, status=0)
+    return paths
+
+
 def test_on_two_ranks_exactly_and_on_another_number_closely(tmp_path):
     """Stopped on two ranks after its fifth step, then resumed on two ranks and on a single rank."""
-    worker = WORKERS / "stop_worker.py"
     scene = hanging(tmp_path, 12, solver={"preset": "newton", "error": 1e-10})
-    for step, name in ((5, "x.h5"), (-1, "whole.h5")):
-        run(2, worker, step, "run", scene, "-o", tmp_path / name, status=0)
-    (tmp_path / "y.h5").write_bytes((tmp_path / "x.h5").read_bytes())
-    assert run(2, worker, -1, "run", "--resume", tmp_path / "x.h5").returncode == 0
-    assert_same(tmp_path / "x.h5", tmp_path / "whole.h5")
-    assert main(["run", "--resume", str(tmp_path / "y.h5")]) == 0
-    assert_same(tmp_path / "y.h5", tmp_path / "whole.h5", rtol=1e-8)
+    path, whole = stopped_and_whole(2, 5, scene)
+    other = shutil.copy(path, tmp_path / "y.h5")
+    run(2, WORKER, -1, "run", "--resume", path, status=0)
+    assert_same(path, whole)
+    assert status_of("run", "--resume", other) == 0
+    assert_same(other, whole, rtol=1e-8)
+
+
+@pytest.mark.parametrize("ranks", [1, pytest.param(3, marks=pytest.mark.slow)])
+def test_on_several_coarse_levels_exactly(tmp_path, ranks: int):
+    tables = BLOCK | {"material": {"young_modulus": 1e9, "density": 1000.0}, "solver": LOOSE}
+    scene = block_scene(tmp_path, **swing(**tables, anchor=TIP_LED))
+    path, whole = stopped_and_whole(ranks, 6, scene, "-pc_mg_levels", 3)
+    run(ranks, WORKER, -1, "run", "--resume", path, status=0)
+    assert_same(path, whole)

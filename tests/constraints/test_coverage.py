@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from block_scene import CELL, DENSITY, YOUNG, block_scene
+from block_scene import CELL, YOUNG, block_scene, solid_of
 from conftest import run
 from mpi4py import MPI
 from one_process import answers_on
@@ -24,23 +24,14 @@ LEFT, LEFT_HALF = (
 )
 # 15 nodes
 RIGHT = {"box": [[0.49, 0, 0], [0.5, 0.5, 0.25]]}
-# 8 cells, with nodes in two layers
-LEFT_CELLS = {"box": [[0, 0, 0], [CELL, 0.5, 0.25]]}
-# 30 nodes, all nodes of LEFT_CELLS
-TWO_LAYERS = {"box": [[0, 0, 0], [CELL + 0.01, 0.5, 0.25]]}
 UP, ASIDE = [{"time": 0.05, "by": [0, 0, 0.02]}], [{"time": 0.05, "by": [0.01, 0, 0]}]
 
 
 def build(folder: Path, **tables) -> Model:
     # two cells of springs are too stiff, and told
-    material = {"young_modulus": YOUNG, "density": DENSITY, "law": "neo-hookean"}
+    material = solid_of(YOUNG)
     scene = load_scene(block_scene(folder, **{"time": TIME, "material": material} | tables))
     return build_model(MPI.COMM_SELF, scene)
-
-
-def assert_warns(lines: list[tuple[str, str]], words: str) -> None:
-    """Assert that a single warning comes, with this beginning."""
-    assert [(level, line[: len(words)]) for level, line in lines] == [("WARNING", words)]
 
 
 @pytest.fixture
@@ -229,7 +220,7 @@ def test_ranks_refuse_and_warn_as_one(tmp_path):
 def test_any_number_of_ranks_tells_the_same_thickness(tmp_path):
     """A strip of half a cell, turned by 30 degrees."""
     turned = {"rotate": {"axis": [0, 1, 0], "degrees": 30}}
-    solid = {"young_modulus": YOUNG, "density": DENSITY, "law": "neo-hookean"}
+    solid = solid_of(YOUNG)
     path = block_scene(tmp_path, [1, 0.25, CELL / 2], time=TIME, material=solid)
     mesh = {"source": "scene.ply", "prepare": [turned]}
     told = []

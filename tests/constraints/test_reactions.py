@@ -6,26 +6,20 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from block_scene import CELL, SIDES, block_scene, play
+from block_scene import CELL, SIDES, block_scene, plane_at, play, solid_of
 from conftest import run
+from one_process import status_of
 
-from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
 
 G = [0.5, 1.0, -9.81]
 BOTTOM = {"box": [[-1, -1, -0.01], [1, 1, 0.01]]}
 TOP = {"box": [[-1, -1, 0.24], [1, 1, 0.26]]}
 EDGE = {"box": [[-1, -1, -0.01], [0.01, 1, 0.01]]}
-SOLID = {"young_modulus": 1e5, "density": 1000.0, "law": "neo-hookean", "poisson_ratio": 0.3}
+SOLID = solid_of(1e5, 0.3)
 TIGHT = {"solver": {"error": 1e-12}, "gravity": {"acceleration": G}}
 LIFT = [{"region": BOTTOM, "path": [{"time": 0.015, "by": [0, 0, 0.01]}]}]
-PLATE = {
-    "shape": "plane",
-    "point": [0, 0, 0.252],
-    "normal": [0, 0, -1],
-    "response": "penalty",
-    "friction": 0.3,
-}
+PLATE = plane_at(0.252, -1, response="penalty", friction=0.3)
 
 
 def totals(frame) -> np.ndarray:
@@ -104,7 +98,7 @@ def test_series_prints_what_the_file_has_and_replaces_nothing_unasked(tmp_path, 
     for ranks in (1, 2):
         path = tmp_path / f"{ranks}.h5"
         run(ranks, "-m", "msmpetsc", "run", scene, "-o", path, "--quiet", status=0)
-        assert main(["series", str(path), "-o", str(path.with_suffix(".csv"))]) == 0
+        assert status_of("series", path, "-o", path.with_suffix(".csv")) == 0
         with path.with_suffix(".csv").open() as file:
             head, *rows = csv.reader(file)
         tables.append(np.array(rows, float))
@@ -119,7 +113,7 @@ def test_series_prints_what_the_file_has_and_replaces_nothing_unasked(tmp_path, 
     )
     assert column["probe top, middle z [m]"][2] == pytest.approx(frames[2].probe[0, 2], rel=1e-12)
     capsys.readouterr()
-    assert main(["series", str(tmp_path / "1.h5"), "-o", str(tmp_path / "1.csv")]) == 2
+    assert status_of("series", tmp_path / "1.h5", "-o", tmp_path / "1.csv") == 2
     assert "exists already: --overwrite replaces it" in capsys.readouterr().err
 
 

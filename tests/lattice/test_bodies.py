@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tomli_w
 import trimesh
-from block_scene import play
+from block_scene import GRAVITY, model_of, plane_at, play
 from conftest import Run, run
 from mpi4py import MPI
 from one_process import input_error
@@ -25,13 +25,7 @@ from msmpetsc.study.metrics import distance_of_shapes, shape_error
 H = 0.125
 SPRINGS = {"young_modulus": 1e5, "density": 1000.0, "law": "linear"}
 UPPER = {"box": [[0, 0, 0.8], [1, 1, 1]], "relative": True}
-GROUND = {
-    "shape": "plane",
-    "point": [0, 0, -0.06],
-    "normal": [0, 0, 1],
-    "response": "penalty",
-    "stiffness": 2e3,
-}
+GROUND = plane_at(-0.06, response="penalty", stiffness=2e3)
 # a ball that falls spinning on the ground, a bar in the same place that hangs and is
 # pulled, a block half of lead
 BODIES: list[dict[str, Any]] = [
@@ -70,7 +64,7 @@ def write(folder: Path, name: str, **tables: Any) -> Path:
         "cages": {"cell_size": H},
         "material": SPRINGS,
         "time": {"step": 0.01, "duration": 0.1},
-        "gravity": {"acceleration": [0, 0, -9.81]},
+        "gravity": GRAVITY,
         "obstacle": [GROUND],
         "solver": {"preset": "newton", "error": 1e-10},
     }
@@ -223,13 +217,10 @@ def test_more_cells_than_can_be_numbered_are_refused():
 
 
 def test_count_is_that_of_all_bodies(folder: Path):
-    scene = load_scene(write(folder, "count", body=BODIES, cages={"count": 1500}))
-    model = build_model(MPI.COMM_SELF, scene)
+    model = model_of(write(folder, "count", body=BODIES, cages={"count": 1500}))
     assert abs(len(model.lattice.cells) / 1500 - 1) <= 0.01
     with pytest.raises(InputError, match=r"cages\.max_cells = 100"):
-        build_model(
-            MPI.COMM_SELF, load_scene(write(folder, "most", body=BODIES), ["cages.max_cells=100"])
-        )
+        model_of(write(folder, "most", body=BODIES), "cages.max_cells=100")
 
 
 # Whose tables
@@ -251,7 +242,7 @@ def test_tables_of_the_scene_are_of_all_bodies(folder: Path):
         "part": [{**part, "density": 3000.0}],
         "start": {"velocity": [1.0, 0, 0]},
     }
-    model = build_model(MPI.COMM_SELF, load_scene(write(folder, "all", body=bodies, **tables)))
+    model = model_of(write(folder, "all", body=bodies, **tables))
     lattice, (_, velocity) = model.lattice, model.start
     first = lattice.body == 0
     assert lattice.pinned[first].any() and not lattice.pinned[~first].any()

@@ -9,17 +9,15 @@ import meshio
 import numpy as np
 import pytest
 import trimesh
-from block_scene import CELL, SIDES, YOUNG, block_scene
+from block_scene import CELL, SIDES, YOUNG, block_scene, model_of
 from conftest import run
-from mpi4py import MPI
+from obj_files import write_obj, write_parts
 
-from msmpetsc.build import Model, build_model
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.surface import Surface, examine
 from msmpetsc.lattice.region import probe_points
-from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.schema import Probe
 
 LEFT = {"box": [[-1, -1, -1], [1e-3, 1, 1]]}
@@ -33,14 +31,6 @@ def block(
     box = trimesh.creation.box(bounds=[[low, 0, 0], [low + sides[0], *sides[1:]]])
     along = box.face_normals[:, 0]
     return box, {"left": along < -0.5, "right": along > 0.5, "side": np.abs(along) < 0.5}
-
-
-def write_obj(path: Path, mesh: trimesh.Trimesh, names: dict[str, np.ndarray]) -> None:
-    lines = [f"v {x} {y} {z}" for x, y, z in mesh.vertices] + ["o block"]
-    for name, own in names.items():
-        lines += [f"g {name}", f"usemtl paint of {name}"]
-        lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in mesh.faces[own]]
-    path.write_text("\n".join(lines))
 
 
 def write_ply(path: Path, mesh: trimesh.Trimesh, names: dict[str, np.ndarray]) -> None:
@@ -88,10 +78,6 @@ def grouped(
     return block_scene(
         folder, sides, mesh={"source": f"block.{end}"} | (mesh or {}), time=ONCE, **tables
     )
-
-
-def model_of(scene: Path, *changes: str) -> Model:
-    return build_model(MPI.COMM_SELF, load_scene(scene, changes))
 
 
 @pytest.mark.parametrize(("end", "name"), [(end, name) for end in WRITERS for name in NAMES[end]])
@@ -166,12 +152,7 @@ def test_a_closed_group_is_all_that_it_encloses(tmp_path: Path):
     halves = {
         name: block(SIDES / [2, 1, 1], low)[0] for name, low in (("near", 0), ("far", 2 * CELL))
     }
-    lines, count = [], 1
-    for name, mesh in halves.items():
-        lines += [f"o {name}", *(f"v {x} {y} {z}" for x, y, z in mesh.vertices)]
-        lines += [f"f {a + count} {b + count} {c + count}" for a, b, c in mesh.faces]
-        count += len(mesh.vertices)
-    (tmp_path / "two.obj").write_text("\n".join(lines))
+    write_parts(tmp_path / "two.obj", halves)
     part = {"region": {"group": "far"}, "density": 3000.0}
     scene = block_scene(
         tmp_path, mesh={"source": "two.obj", "prepare": ["union"]}, time=ONCE, part=[part]

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import CELL, DENSITY, SIDES, block_scene, play
+from block_scene import CELL, DENSITY, GRAVITY, SIDES, block_scene, loop_of, play, solid_of
 from conftest import result_on, run
 from mpi4py import MPI
 
@@ -14,7 +14,6 @@ from msmpetsc.errors import InputError
 from msmpetsc.fields import Frame
 from msmpetsc.results.checkpoint_reader import end_of_run
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.simulate import TimeLoop
 
 T = 1 / 128
 MIDDLE, MASS = SIDES / 2, DENSITY * SIDES.prod()
@@ -29,10 +28,9 @@ def begin(folder: Path, start: dict, **tables) -> tuple[Model, list[Frame]]:
 
 def at_start(folder: Path, start: dict) -> tuple[Model, Frame]:
     """Return the start alone: a step of a body that is a line is decided by rounding."""
-    scene = load_scene(block_scene(folder, time={"step": T, "duration": T}, start=start))
-    model = build_model(MPI.COMM_SELF, scene)
-    with TimeLoop(MPI.COMM_SELF, scene, model) as simulation:
-        return model, next(simulation.frames())
+    path = block_scene(folder, time={"step": T, "duration": T}, start=start)
+    with loop_of(path) as simulation:
+        return simulation.model, next(simulation.frames())
 
 
 @pytest.mark.parametrize("scale", [[1, 1, 0.25], [1, 0, 0], [1, 1, 0], [-1, 1, 1], [-2, 0.5, 3]])
@@ -172,10 +170,8 @@ def test_swirl_of_the_twisting_column(tmp_path: Path, h: float):
         start={"about": [0.5, 0, 0.5], "swirl": swirl},
         time={"step": 1e-4, "duration": 1e-4},
     )
-    scene = load_scene(path)
-    model = build_model(MPI.COMM_SELF, scene)
-    with TimeLoop(MPI.COMM_SELF, scene, model) as simulation:
-        frame = next(simulation.frames())
+    with loop_of(path) as simulation:
+        model, frame = simulation.model, next(simulation.frames())
     assert frame.kinetic == pytest.approx(3.031875e6 * (1 + 2 * h**2), rel=1e-12)
     q, velocity = model.start
     momentum = model.lattice.mass @ np.cross(q - [0.5, 0, 0.5], velocity)
@@ -194,8 +190,8 @@ def test_a_swirl_is_constant_beyond_its_table(tmp_path: Path):
 
 def hung(folder: Path, name: str, **tables) -> Path:
     """A block that hangs by its side."""
-    material = {"young_modulus": 2e4, "density": DENSITY, "law": "neo-hookean"}
-    gravity = {"acceleration": [0, 0, -9.81]}
+    material = solid_of(2e4)
+    gravity = GRAVITY
     tables = {"pin": NEAR, "material": material, "gravity": gravity} | tables
     return block_scene(folder, name=name, **tables)
 

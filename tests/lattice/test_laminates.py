@@ -5,15 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from block_scene import CELL, DENSITY, SIDES, YOUNG, block_scene
+from block_scene import CELL, DENSITY, SIDES, YOUNG, block_scene, model_of
 from laminates import COATS, THREE, Bar, error
-from mpi4py import MPI
+from obj_files import write_parts
 from small_strain import SPRINGS
 
-from msmpetsc.build import build_model
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.material import edge_stiffness
-from msmpetsc.scene.reading import load_scene
 
 SKIN = Bar((0.0, *COATS), 10, bends=True)
 PLY = Bar((0.0, *THREE), 10, bends=False)
@@ -21,7 +19,7 @@ PLY = Bar((0.0, *THREE), 10, bends=False)
 
 def lattice_of(folder: Path, **tables) -> Lattice:
     scene = block_scene(folder, time={"step": 0.01, "duration": 0.01}, **tables)
-    return build_model(MPI.COMM_SELF, load_scene(scene)).lattice
+    return model_of(scene).lattice
 
 
 def test_coats_of_a_fifth_of_a_cell_bend_a_bar():
@@ -61,13 +59,8 @@ def test_mass_is_that_of_the_volumes(tmp_path: Path, place: float, law: str):
 def test_closed_groups_askew_have_their_volumes(tmp_path: Path):
     """Two blocks fill a body that the grid cuts. A sample outside the body counts for neither."""
     bounds = {"near": [[0, 0, 0], SIDES * [0.4, 1, 1]], "far": [SIDES * [0.4, 0, 0], SIDES]}
-    lines, count = [], 1
-    for name, corners in bounds.items():
-        mesh = trimesh.creation.box(bounds=corners)
-        lines += [f"o {name}", *(f"v {x} {y} {z}" for x, y, z in mesh.vertices)]
-        lines += [f"f {a + count} {b + count} {c + count}" for a, b, c in mesh.faces]
-        count += len(mesh.vertices)
-    (tmp_path / "two.obj").write_text("\n".join(lines))
+    boxes = {name: trimesh.creation.box(bounds=corners) for name, corners in bounds.items()}
+    write_parts(tmp_path / "two.obj", boxes)
     turn = {"rotate": {"axis": [1.0, 2.0, 3.0], "degrees": 50.0}}
     parts = [
         {"region": {"group": "near"}, "density": 2 * DENSITY, "young_modulus": 3 * YOUNG},

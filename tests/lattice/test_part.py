@@ -5,13 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import CELL, DENSITY, SIDES, YOUNG, block_scene, play
-from mpi4py import MPI
+from block_scene import CELL, DENSITY, SIDES, YOUNG, block_scene, model_of, play, solid_of
 
-from msmpetsc.build import Model, build_model
+from msmpetsc.build import Model
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.errors import InputError
-from msmpetsc.scene.reading import load_scene
 
 T = 1 / 64
 # the cells beyond the middle of the length
@@ -22,9 +20,7 @@ ONCE = {"step": T, "duration": T}
 
 
 def of_parts(folder: Path, *parts: dict, **tables) -> Model:
-    return build_model(
-        MPI.COMM_SELF, load_scene(block_scene(folder, time=ONCE, part=list(parts), **tables))
-    )
+    return model_of(block_scene(folder, time=ONCE, part=list(parts), **tables))
 
 
 # ---- material of a node and a spring
@@ -58,7 +54,7 @@ def test_each_cell_gives_its_share_to_its_springs(tmp_path: Path):
 
 def test_each_cell_resists_as_its_own_material(tmp_path: Path):
     """Each cell of a mirrored solid has the same energy density, times E of the cell."""
-    law = {"material": {"young_modulus": YOUNG, "density": DENSITY, "law": "neo-hookean"}}
+    law = {"material": solid_of(YOUNG)}
     soft = of_parts(tmp_path, **law).lattice
     lattice = of_parts(tmp_path, {"region": FAR, "young_modulus": 5 * YOUNG}, **law).lattice
     energies = [Elasticity(one).energy(one.nodes * [1, 1, -1]) for one in (soft, lattice)]

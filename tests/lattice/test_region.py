@@ -2,29 +2,21 @@
 
 import logging
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 import solid_runs as study
-from block_scene import CELL, block_scene
+from block_scene import CELL, block_scene, model_of, play
 from conftest import ROOT
-from mpi4py import MPI
 
-from msmpetsc.build import Model, build_model
+from msmpetsc.build import Model
 from msmpetsc.constraints.holders import LEAST
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.readers import read_surface
-from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.simulate import TimeLoop
 
 CASES = ROOT / "tests" / "cases"
 TIME = {"step": 0.01, "duration": 0.1}
 limit = cache(lambda: study.limit(6, 8))
-
-
-def build(path: Path, *changes: str) -> Model:
-    return build_model(MPI.COMM_SELF, load_scene(path, changes))
 
 
 def pinned(model: Model) -> np.ndarray:
@@ -37,7 +29,7 @@ def test_a_relative_box_up_to_one_holds_what_sticks_out(tmp_path, cells):
     sides = np.array([0.5, 0.1, 0.1])
     upper = {"region": {"box": [[0, 0, 0.8], [1, 1, 1]], "relative": True}}
     path = block_scene(tmp_path, sides, time=TIME, cages={"count": cells}, pin=[upper])
-    model = build(path)
+    model = model_of(path)
     nodes = model.lattice.nodes
     # some nodes stick out of the body
     assert nodes[:, 2].max() > sides[2]
@@ -48,7 +40,7 @@ def test_a_plane_that_grazes_a_body_clamps_what_it_touches(caplog):
     """Nodes below parts that are only near the plane were pinned, too: 67 of 91, and the body 10
     times too stiff."""
     path = CASES / "bunny_grazing_pin.toml"
-    model = build(path)
+    model = model_of(path)
     surface = read_surface(CASES / "bunny_cut.ply")
     touching = surface.points[surface.points[:, 2] <= 1e-6]
     far = np.linalg.norm(pinned(model)[:, None] - touching, axis=2).min(axis=1)
@@ -70,8 +62,8 @@ def test_a_plane_that_grazes_a_body_clamps_what_it_touches(caplog):
 def test_what_is_led_or_pushed_is_what_would_be_pinned(kind, more):
     region = "region = { half_space = { point = [0, 0, 1e-6], normal = [0, 0, -1] } }"
     path = CASES / "bunny_grazing_pin.toml"
-    pinned = build(path).lattice.pinned.sum()
-    (words,) = build(path, "pin=[]", f"{kind}=[{{ {region}, {more} }}]").node_counts
+    pinned = model_of(path).lattice.pinned.sum()
+    (words,) = model_of(path, "pin=[]", f"{kind}=[{{ {region}, {more} }}]").node_counts
     assert f" {pinned} nodes" in words and pinned < 30
 
 
@@ -81,9 +73,7 @@ def test_what_is_led_or_pushed_is_what_would_be_pinned(kind, more):
 def test_a_plane_that_grazes_a_body_leaves_it_as_soft_as_it_is(law, low, high):
     """Work of the weight: 9.65e-5 J by 11,206 quadratic tetrahedra (scikit-fem), clamped where they
     touch the plane."""
-    scene = load_scene(CASES / "bunny_grazing_pin.toml", [f"material.law={law}"])
-    with TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
-        first, *_, last = simulation.frames()
+    _, (first, *_, last) = play(CASES / "bunny_grazing_pin.toml", f"material.law={law}")
     assert low < (first.potential - last.potential) / 9.65e-5 < high
 
 
@@ -103,7 +93,7 @@ def test_a_region_without_material_says_where_body_and_region_are(tmp_path, kind
         r"0.251\) to \(1, 1, 2\) m"
     )
     with pytest.raises(InputError, match=rf"^{kind}\.0\.region holds .*no.*{where}$"):
-        build(path)
+        model_of(path)
 
 
 @pytest.mark.parametrize("held", [1.0, 0.0], ids=["plane through cells", "end face"])
@@ -120,7 +110,7 @@ def test_a_tilted_clamp_converges_in_second_order(held):
 def test_a_spring_that_a_clamp_cuts_is_as_stiff_as_what_of_it_is_free(tmp_path, edge):
     pin = {"region": {"box": [[-1, -1, -1], [edge, 1, 1]]}}
     path = block_scene(tmp_path, time=TIME, pin=[pin])
-    lattice, uncut = build(path).lattice, build(path, "pin=[]").lattice
+    lattice, uncut = model_of(path).lattice, model_of(path, "pin=[]").lattice
     x, held = lattice.nodes[lattice.springs][..., 0], lattice.pinned[lattice.springs]
     free = np.where(held.any(axis=1) & ~held.all(axis=1), (x.max(axis=1) - edge) / CELL, 1.0)
     assert free.min() == pytest.approx(2 - edge / CELL)

@@ -4,21 +4,23 @@ import inspect
 import shlex
 import signal
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
 import pytest
-from block_scene import block_scene
+from block_scene import GRAVITY, block_scene
 from conftest import WORKERS, run
 from one_process import errors, input_error
 
 import msmpetsc
+from msmpetsc.app import abort
 from msmpetsc.app.request import OPTIONS, RunRequest
 from msmpetsc.cli.main import main, parsed
 from msmpetsc.errors import InputError
 from msmpetsc.solve.petsc.words import options_of
 
-FALL = {"gravity": {"acceleration": [0, 0, -9.81]}, "time": {"step": 0.01, "duration": 0.05}}
+FALL = {"gravity": GRAVITY, "time": {"step": 0.01, "duration": 0.05}}
 
 
 @pytest.fixture
@@ -149,6 +151,21 @@ def test_a_failure_of_some_ranks_ends_all_with_its_line_and_status(tmp_path, ran
         and "Traceback" not in done.stderr
     )
     assert not [path.name for path in tmp_path.glob("*x.h5.*")]
+
+
+def test_ranks_lose_patience_seconds_apart(monkeypatch):
+    """So that the first ends the others before they report the error, too."""
+    clock = SimpleNamespace(now=0.0, monotonic=lambda: clock.now)
+    clock.sleep = lambda seconds: setattr(clock, "now", clock.now + seconds)
+    monkeypatch.setattr(abort, "time", clock)
+    ends = []
+    for rank in range(3):
+        meeting = SimpleNamespace(rank=rank, size=3)
+        meeting.Ibarrier = lambda: SimpleNamespace(Test=lambda: False)
+        assert not abort._all_fail(meeting)
+        ends.append(clock.now)
+    waits = np.diff([0.0, *ends])
+    assert np.diff(waits).min() > 3
 
 
 def test_completion_offers_public_names_alone():

@@ -9,9 +9,8 @@ from pathlib import Path
 import manifold3d
 import numpy as np
 import pytest
-import tomli_w
 import trimesh
-from block_scene import play
+from block_scene import play, solid_of, write_scene
 from conftest import result_on
 from mpi4py import MPI
 from scipy.sparse import coo_array, csr_array
@@ -210,18 +209,14 @@ def pulled(folder: Path, mesh: trimesh.Trimesh, low: list, high: list, **tables:
     scene = {
         "mesh": {"source": "body.ply"},
         "cages": {"cell_size": H},
-        "material": {
-            "young_modulus": YOUNG, "density": 1000.0, "law": "neo-hookean", "poisson_ratio": 0.3,
-        },
+        "material": solid_of(YOUNG, 0.3),
         "time": {"step": 1.0, "duration": 1.0, "integrator": "static"},
         "pin": [{"region": {"box": [[-1, -1, -1], [0.01, 2, 2]]}}],
         "force": forces,
         "solver": {"error": 1e-4},
         "output": {"surface": True},
     }  # fmt: skip
-    path = folder / "body.toml"
-    path.write_text(tomli_w.dumps(scene | tables))
-    return path
+    return write_scene(folder, **scene | tables)
 
 
 TIPS = [[1.85, -1, -1], [2.1, 0.15, 2]], [[1.85, 0.35, -1], [2.1, 1, 2]]
@@ -271,9 +266,7 @@ def test_two_free_forks_move_as_each_alone(tmp_path: Path):
     spin = {"velocity": [0.0, 0.0, 0.0], "spin": [0.0, 0.0, 4.0]}
     scene = {
         "cages": {"cell_size": H},
-        "material": {
-            "young_modulus": YOUNG, "density": 1000.0, "law": "neo-hookean", "poisson_ratio": 0.3,
-        },
+        "material": solid_of(YOUNG, 0.3),
         "time": {"step": 0.05, "duration": 0.1},
         "solver": {"preset": "newton-multigrid", "error": 1e-8},
         "output": {"surface": False},
@@ -284,9 +277,7 @@ def test_two_free_forks_move_as_each_alone(tmp_path: Path):
     ]
     ends = []
     for name, some in (("two", bodies), ("one", bodies[:1])):
-        path = tmp_path / f"{name}.toml"
-        path.write_text(tomli_w.dumps(scene | {"body": some}))
-        model, frames = play(path)
+        model, frames = play(write_scene(tmp_path, name, **scene, body=some))
         ends.append((frames[-1].position - model.lattice.nodes, len(model.lattice.mass)))
     (two, _), (one, nodes) = ends
     np.testing.assert_allclose(two[:nodes], one, atol=1e-7)

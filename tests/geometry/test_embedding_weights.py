@@ -290,6 +290,3 @@ def test_error_on_a_bent_bar_falls_with_the_square_of_the_cell_size(kind):
     errors = [rms_error(kind, size) for size in SIZES]
     slope = np.polyfit(np.log(SIZES), np.log(errors), 1)[0]
     assert 1.8 < slope < 2.3
-
-
-# ---- single cells, smoothing, misuse

@@ -12,11 +12,10 @@ from pathlib import Path
 
 import pytest
 from conftest import ROOT, python
-from one_process import command_error
+from one_process import command_error, status_of
 from study_files import SCENE, own_log  # noqa: F401 (fixtures)
 
 from msmpetsc.cli.commands import plan as plan_command
-from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.study.cases import Case
@@ -124,6 +123,10 @@ class Bodies:
     def result_of(self, case: Case) -> Path:
         return Path(case.id)
 
+    def distance(self, a: float, b: float) -> float:
+        """Return the distance of two results of these errors."""
+        return abs(a - b)
+
     def error_of(self, method: PlannedMethod, cells: int) -> float:
         time = method.time_error or (1e-3 if method.integrator == "verlet" else 0.0)
         stuck = 0.3 * (len(self.errors) % 2) if self.impacts else 0.0
@@ -148,14 +151,16 @@ class Bodies:
         return row | {"inverted": self.inverted(cells)}
 
 
-def sized(tmp_path: Path, monkeypatch, target: float, **bodies) -> tuple[SizePlan, Bodies, list]:
+def sized(
+    tmp_path: Path, monkeypatch, target: float, cells: int = 6400, advised: float = 0.0, **bodies
+) -> tuple[SizePlan, Bodies, list]:
     (tmp_path / "scene.toml").write_text(SCENE)
     bench, said = Bodies(**bodies), []
     monkeypatch.setattr(
-        trials, "surface_error", lambda a, b: abs(bench.errors[a] - bench.errors[b])
+        trials, "surface_error", lambda a, b: bench.distance(bench.errors[a], bench.errors[b])
     )
-    sizer = Sizer(tmp_path / "scene.toml", bench, Asked(target, 10, 6400), said.append)
-    return sizer.plan(), bench, said
+    asked = Asked(target, 10, cells, advised=advised)
+    return Sizer(tmp_path / "scene.toml", bench, asked, said.append).plan(), bench, said
 
 
 @pytest.mark.parametrize("explicit", [True, False])
@@ -189,15 +194,9 @@ def test_a_choice_is_little_better_than_asked_for_where_lattices_err_by_chance(
     Their sum was twice as much.
     """
 
-    def distance_between(a: Path, b: Path) -> float:
-        return math.sqrt(abs(bench.errors[a] ** 2 - bench.errors[b] ** 2))
-
-    (tmp_path / "scene.toml").write_text(SCENE)
-    bench = Bodies(explicit=False)
     monkeypatch.setattr(Bodies, "error_of", lambda self, method, cells: 1.4 * cells ** (-1 / 3))
-    monkeypatch.setattr(trials, "surface_error", distance_between)
-    plan = Sizer(tmp_path / "scene.toml", bench, Asked(target, 10, 64_000),
-    print).plan()  # fmt: skip
+    monkeypatch.setattr(Bodies, "distance", lambda self, a, b: math.sqrt(abs(a**2 - b**2)))
+    plan, *_ = sized(tmp_path, monkeypatch, target, 64_000, explicit=False)
     assert plan.met and 0.6 * target < 1.4 * plan.choice.cells ** (-1 / 3) < 1.1 * target
 
 
@@ -210,7 +209,7 @@ def test_statics_are_planned_by_their_cells_alone(tmp_path: Path, monkeypatch):
     assert plan.met and {each.method.integrator for each in plan.tried} == {"static"}
     assert 0.07 < bench.error_of(plan.choice.method, plan.choice.cells) <= 0.1
     monkeypatch.setattr(plan_command, "size_all", lambda *_: plan)
-    assert main(["plan", str(tmp_path / "scene.toml"), "--surface-error", "0.1", "--write"]) == 0
+    assert status_of("plan", tmp_path / "scene.toml", "--surface-error", "0.1", "--write") == 0
     written = load_scene(tmp_path / "scene.toml")
     assert (
         written.cages.count == plan.choice.cells
@@ -221,13 +220,9 @@ def test_statics_are_planned_by_their_cells_alone(tmp_path: Path, monkeypatch):
 def test_few_cells_are_tried_first(tmp_path: Path, monkeypatch):
     """64,000 cells may be tried: 0.1 takes a hundred, which 1,000 tell; 0.01 takes as many as there
     are."""
-    (tmp_path / "scene.toml").write_text(SCENE)
     for target, finest in ((0.1, 1000), (0.01, 64_000)):
-        bench = Bodies(cell_error=1.0)
-        monkeypatch.setattr(trials, "surface_error", lambda a, b, e=bench.errors: abs(e[a] - e[b]))
-        sizer = Sizer(tmp_path / "scene.toml", bench, Asked(target, 10, 64_000), print)
-        plan = sizer.plan()
-        assert plan.met and max(each.cells for each in sizer.trials) == finest
+        plan, bench, _ = sized(tmp_path, monkeypatch, target, 64_000)
+        assert plan.met and max(each.cells for each in plan.tried) == finest
         assert bench.error_of(plan.choice.method, plan.choice.cells) > 0.7 * target
 
 
@@ -236,15 +231,8 @@ def test_thin_walls_are_tried_on_enough_cells(
     tmp_path: Path, monkeypatch, advised: float, finest: int
 ):
     """And the plan says so if it chooses fewer: 0.1 takes a hundred."""
-    (tmp_path / "scene.toml").write_text(SCENE)
-    bench = Bodies(cell_error=1.0)
-    monkeypatch.setattr(
-        trials, "surface_error", lambda a, b: abs(bench.errors[a] - bench.errors[b])
-    )
-    asked = Asked(0.1, 10, 64_000, advised=advised)
-    sizer = Sizer(tmp_path / "scene.toml", bench, asked, print)
-    plan = sizer.plan()
-    assert max(each.cells for each in sizer.trials) == finest
+    plan, *_ = sized(tmp_path, monkeypatch, 0.1, 64_000, advised)
+    assert max(each.cells for each in plan.tried) == finest
     told = (
         f"on {plan.choice.cells} cells a tenth of a body bends too little; {advised:.0f} would do"
     )
@@ -284,7 +272,6 @@ def test_no_refusal_without_a_finer_lattice(tmp_path: Path, monkeypatch):
 def test_orders_that_differ_are_assumed_to_be_their_mean(tmp_path: Path, monkeypatch):
     """100, 800, 6,400 cells show order 1, and 800, 6,400, 18,102 the steepest order, 2.2."""
     errors = {100: 0.2, 800: 0.1, 6400: 0.05, 18102: 0.043}
-    (tmp_path / "scene.toml").write_text(SCENE)
 
     def by_cells(bench: Bodies, method: PlannedMethod, cells: int) -> float:
         return errors.get(cells, 0.043)
@@ -403,7 +390,7 @@ def soft_beam(tmp_path: Path) -> Path:
 def test_the_true_error_of_a_plan_is_what_was_asked_for(soft_beam: Path):
     """A soft beam, against a run in explicit substeps, whose own error is little."""
     words = ["--surface-error", "0.1", "--cells", "1000", "--frames", "20", "--write"]
-    assert main(["plan", str(soft_beam), *words]) == 0
+    assert status_of("plan", soft_beam, *words) == 0
     every = max(1, round(1 / 60 / load_scene(soft_beam).time.step))
     # simulated time of the trials [s]
     tried = 20 / 60
@@ -422,7 +409,7 @@ def test_the_true_error_of_a_plan_of_statics_is_what_was_asked_for(soft_beam: Pa
     time = text[text.index("[time]") : text.index("[gravity]")]
     soft_beam.write_text(text.replace(time, f"[time]\n{STATIC}\n\n"))
     assert (
-        main(["plan", str(soft_beam), "--surface-error", "0.05", "--cells", "1000", "--write"]) == 0
+        status_of("plan", soft_beam, "--surface-error", "0.05", "--cells", "1000", "--write") == 0
     )
     assert 0.6 * 0.05 < true_error(soft_beam, choice=[], finer=[]) < 1.1 * 0.05
 
@@ -437,13 +424,13 @@ def test_the_command_tells_the_answer_and_writes_it(tmp_path: Path, monkeypatch,
     monkeypatch.setattr(plan_command, "size_all", lambda *_: print("what was tried") or PLAN)
     path = tmp_path / "scene.toml"
     path.write_text(SCENE.replace("count = 10", "cell_size = 0.1"))
-    assert main(["plan", str(path), "--surface-error", "0.1", "--write"]) == 0
+    assert status_of("plan", path, "--surface-error", "0.1", "--write") == 0
     out, written = capsys.readouterr().out, load_scene(path)
     assert "7.5 computing seconds a simulated second" in out and "the step: planted" in out
     assert written.cages.count == 4321 and written.cages.cell_size is None
     assert (written.time.integrator, written.time.error) == ("bdf2", 0.005)
     assert written.solver.error == 0.01
-    assert main(["plan", str(path), "--json"]) == 0
+    assert status_of("plan", path, "--json") == 0
     answer = json.loads(capsys.readouterr().out)
     assert (
         answer["met"]
@@ -514,7 +501,7 @@ def test_what_cannot_be_met_is_told_with_status_3_and_not_written(
     monkeypatch.setattr(plan_command, "size_all", lambda *_: replace(PLAN, met=False))
     path = tmp_path / "scene.toml"
     path.write_text(SCENE)
-    assert main(["plan", str(path), "--surface-error", "0.01", "--write"]) == 3
+    assert status_of("plan", path, "--surface-error", "0.01", "--write") == 3
     assert path.read_text() == SCENE and "nothing meets 0.01" in capsys.readouterr().out
 
 

@@ -11,12 +11,11 @@ import pyvista
 import small_result
 import trimesh
 import vtk
-from one_process import input_error
+from one_process import input_error, status_of
 from small_result import DT, FRAMES, NODES, POINTS, H, X, position
 from vtk.util.numpy_support import vtk_to_numpy
 
 import msmpetsc
-from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
 from msmpetsc.export.formats import FORMATS, export, normals
 from msmpetsc.fields import Frame
@@ -169,15 +168,15 @@ def test_the_command(result: Path, tmp_path: Path, ending: str, capsys: pytest.C
     if ending.startswith(".usd"):
         pytest.importorskip("pxr", reason="usd-core is not installed: the extra usd")
     path = tmp_path / "new" / f"y{ending}"
-    assert main(["export", str(result), "-o", str(path)]) == 0
+    assert status_of("export", result, "-o", path) == 0
     assert capsys.readouterr().out == f"{path}\n" and path.is_file()
-    assert main(["export", str(result), "-o", str(path), "--frames", "9"]) == 2
+    assert status_of("export", result, "-o", path, "--frames", "9") == 2
     assert "not 9" in capsys.readouterr().err
 
 
 def test_slices_choose_frames_as_for_render(result: Path, tmp_path: Path):
     for name, frames in (("slice.glb", "0:5:2"), ("list.glb", "0,2,-1")):
-        assert main(["export", str(result), "-o", str(tmp_path / name), "--frames", frames]) == 0
+        assert status_of("export", result, "-o", tmp_path / name, "--frames", frames) == 0
     whole = export(result, tmp_path / "whole.glb", frames=[0, 2, 4])
     assert (
         (tmp_path / "slice.glb").read_bytes()

@@ -9,10 +9,9 @@ from pathlib import Path
 
 import h5py
 import pytest
-from one_process import command_error
+from one_process import command_error, status_of
 from stopped_runs import assert_same, at_step, every_step_forgets, hanging  # noqa: F401  # a fixture
 
-from msmpetsc.cli.main import main
 from msmpetsc.results.untrusted_file import finished
 
 # number of steps, and the step after which the disk is full
@@ -24,7 +23,7 @@ FINE = {"cages": {"cell_size": 1 / 32}, "output": {"surface": False}}
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("whole")
-    assert main(["run", str(hanging(folder, STEPS, **FINE)), "-o", str(folder / "whole.h5")]) == 0
+    assert status_of("run", hanging(folder, STEPS, **FINE), "-o", folder / "whole.h5") == 0
     return folder / "whole.h5"
 
 
@@ -65,7 +64,7 @@ def test_a_disk_that_fills_up(whole: Path, small_disk: Path, monkeypatch):
     with h5py.File(path) as file:
         assert finished(file) == 1 + BEFORE
     ballast.unlink()
-    assert main(["run", "--resume", str(path)]) == 0
+    assert status_of("run", "--resume", path) == 0
     assert_same(path, whole)
 
 

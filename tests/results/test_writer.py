@@ -127,11 +127,7 @@ def test_no_write_leaves_a_broken_file(tmp_path, monkeypatch):
         marks[len(disk.log)] = index, index - 1
         file.append(frame(index))
         marks[len(disk.log)] = index + 1, index - 1
-        file.write_checkpoint(
-            Checkpoint(
-                index, {"q": positions(index, NODES), "q_previous": positions(index - 1, NODES)}
-            )
-        )
+        file.write_checkpoint(saved(index))
     marks[len(disk.log)] = 12, 11
     file.close()
     # the trimming wrote to the file

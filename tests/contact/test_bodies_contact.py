@@ -7,29 +7,24 @@ from typing import Any
 
 import numpy as np
 import pytest
-import tomli_w
 import trimesh
-from block_scene import ROUGH_GROUND, play
+from block_scene import GRAVITY, ROUGH_GROUND, loop_of, model_of, play, solid_of, write_scene
 from conftest import result_on
-from crossings import count_crossings
+from crossings import crossings
 from mpi4py import MPI
 
 import msmpetsc.contact.surface.pairs
-from msmpetsc.build import Model, build_model
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw
 from msmpetsc.contact.surface.pairs import CandidateCache, ContactSearch
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError
-from msmpetsc.fields import Frame
 from msmpetsc.geometry.surface import Surface
-from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.integrators.implicit import ContactFaces
 from msmpetsc.solve.nonlinear.error_control import Outcome
 from msmpetsc.solve.nonlinear.functional import StepProblem
-from msmpetsc.solve.simulate import TimeLoop
 
 CELL, SIDE, DISTANCE, G = 0.05, 0.2, 1e-3, 9.81
-SOLID = {"young_modulus": 1e5, "density": 1000.0, "law": "neo-hookean"}
+SOLID = solid_of(1e5)
 
 
 @pytest.fixture(scope="module")
@@ -52,16 +47,14 @@ def write(folder: Path, name: str, **tables: Any) -> Path:
         "self_contact": {"distance": DISTANCE, "friction": 0.5},
         "solver": {"preset": "newton", "error": 1e-4},
     }
-    path = folder / f"{name}.toml"
-    path.write_text(tomli_w.dumps(scene | tables))
-    return path
+    return write_scene(folder, name, **scene | tables)
 
 
 def pile(folder: Path, meshes: list[str], gap: float) -> Path:
     """Return the scene of a block on a pinned block, with a distance [m] between them."""
     pin = [{"region": {"box": [[0, 0, 0], [1, 1, 0.1]], "relative": True}}]
     bodies = [body(meshes[0], [0, 0, 0], pin=pin), body(meshes[1], [0, 0, SIDE + gap])]
-    time, gravity = {"step": 0.01, "duration": 0.1}, {"acceleration": [0, 0, -G]}
+    time, gravity = {"step": 0.01, "duration": 0.1}, GRAVITY
     return write(folder, "pile", body=bodies, time=time, gravity=gravity)
 
 
@@ -98,7 +91,7 @@ def fall(folder: Path, name: str, height: float, **tables: Any) -> Path:
     # Springs come to rest sooner than a solid.
     tables = {
         "material": SOLID | {"law": "linear"},
-        "gravity": {"acceleration": [0, 0, -G]},
+        "gravity": GRAVITY,
     } | tables
     return write(folder, name, body=bodies, obstacle=[ROUGH_GROUND], **tables)
 
@@ -110,12 +103,6 @@ def test_a_solid_ball_lands_on_its_lowest_cells_which_are_slivers(folder: Path):
     model, frames = play(fall(folder, "solid", 0.02, **tables))
     assert max(frame.self_contacts for frame in frames) > 20 and frames[-1].substeps == 0
     assert crossings(model, frames) == 0
-
-
-def crossings(model: Model, frames: list[Frame]) -> int:
-    """Return how many edges cross triangles, over all frames."""
-    assert model.surface is not None
-    return sum(count_crossings(frame.surface, model.surface.triangles) for frame in frames)
 
 
 @pytest.mark.parametrize(
@@ -156,7 +143,7 @@ def test_a_way_is_cut_where_pairs_are_known_at_its_end_alone(folder: Path):
     """A line search looked behind the block, and the way there is asked for again: once a corner
     passed through so."""
     scene = fall(folder, "way", 0.02, time={"step": 0.01, "duration": 0.01})
-    model = build_model(MPI.COMM_SELF, load_scene(scene))
+    model = model_of(scene)
     assert model.collision is not None
     start = model.lattice.nodes.copy()
     end = start - np.where(model.lattice.body[:, None] == 1, [0, 0, 0.02 + 2.5 * SIDE], 0.0)
@@ -233,7 +220,7 @@ def begun_with_all(self: Environment, q: np.ndarray, time: float, time_step: flo
 def test_what_stores_too_little_to_count_may_be_left_out(folder: Path, monkeypatch):
     monkeypatch.setattr(msmpetsc.contact.surface.pairs, "FEW", 1.0)
     scene = fall(folder, "light", 0.002, time={"step": 0.01, "duration": 0.01})
-    model = build_model(MPI.COMM_SELF, load_scene(scene))
+    model = model_of(scene)
     assert model.collision is not None
     contacts, start = (
         ContactSearch(CandidateCache(MPI.COMM_SELF, model.collision), 0.0, 0.01),
@@ -273,13 +260,9 @@ def test_a_correction_through_the_surface_says_little_of_the_error(folder: Path)
         {"step": 0.01, "duration": 0.01},
         {"acceleration": [0, 0, -500.0]},
     )
-    scene = load_scene(write(folder, "through", body=bodies, time=time, gravity=gravity))
-    with TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
-        environment, stepper, state = (
-            simulation.environment,
-            simulation.integrator.stepper,
-            simulation.state,
-        )
+    with loop_of(write(folder, "through", body=bodies, time=time, gravity=gravity)) as simulation:
+        environment, state = simulation.environment, simulation.state
+        stepper = simulation.integrator.stepper
         functional, optimality, q = stepper.functional, stepper.optimality, state.q
         y, load = 2 * q - state.q_previous, environment.forces.at(0.01)
         faces = ContactFaces(environment, q, y, load, 0.01, 0.01, None, stepper.lattice.pinned)

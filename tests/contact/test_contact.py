@@ -6,14 +6,31 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from block_scene import CELL, DENSITY, GROUND, SIDES, STIFFEST, YOUNG, G, block_scene, play
+from block_scene import (
+    CELL,
+    DENSITY,
+    GRAVITY,
+    GROUND,
+    ROUGH_GROUND,
+    SIDES,
+    STIFFEST,
+    YOUNG,
+    G,
+    block_scene,
+    box_at,
+    plane_at,
+    play,
+    solid_of,
+)  # fmt: skip
 from mpi4py import MPI
 from obstacles import box, plane, sphere
 
+from msmpetsc.build import Model
 from msmpetsc.constraints.time_functions import Motion
 from msmpetsc.contact.obstacles.penalty import Penalty
 from msmpetsc.contact.obstacles.reflection import Exchange, StepTaken
 from msmpetsc.contact.step_contact import StepContact
+from msmpetsc.fields import Frame
 from msmpetsc.scene.motion import Pose
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
@@ -289,41 +306,21 @@ def test_a_stiff_die_comes_to_rest_though_contact_is_stiffer_than_the_corners_th
     )
     die.apply_translation([0, 0, 0.02 - die.bounds[0, 2]])
     die.export(tmp_path / "die.ply")
-    material = {
-        "young_modulus": 1e10,
-        "density": DENSITY,
-        "poisson_ratio": 0.3,
-        "law": "neo-hookean",
-    }
+    material = solid_of(1e10, 0.3)
     tables = {"cages": {"count": 64}, "material": material, "solver": {"error": 1e-3}}
     scene = grounded(tmp_path, [0, 0, -G], 45, 0.01, GROUND, mesh={"source": "die.ply"}, **tables)
     _, frames = play(scene)
     assert frames[-1].kinetic < 1e-3
 
 
-def slide(
-    folder: Path,
-    slope: float,
-    steps: int = 60,
-    t: float = 0.01,
-    speed: dict | None = None,
-    **tables,
-):
-    """Velocities (steps + 1, 3) [m/s] of the mass centre, the weight tilted towards x by an angle
-    of this tangent."""
-    down, ground = (
-        np.array([slope, 0, -1]) / np.hypot(slope, 1),
-        GROUND | {"friction": 0.5} | (speed or {}),
-    )
-    model, frames = play(grounded(folder, list(G * down), steps, t, ground, **tables))
-    return np.array([frame.momentum for frame in frames]) / model.lattice.mass.sum()
-
-
 @pytest.mark.parametrize("given, error", [({}, 1e-9), ({"friction_speed": 1e-3}, 1e-6)])
 def test_friction_holds_a_block_on_a_gentle_slope(tmp_path: Path, given: dict, error: float):
     """It gives way by f'(u / e) = 2 s - s^2 = tan / mu = 0.6: s = 0.37, once, and again after 20
     steps: not in each."""
-    speed = slide(tmp_path, 0.3, 80, 0.02, given, solver={"error": error})[:, 0]
+    gravity = list(G * np.array([0.3, 0, -1]) / np.hypot(0.3, 1))
+    scene = grounded(tmp_path, gravity, 80, 0.02, ROUGH_GROUND | given, solver={"error": error})
+    model, frames = play(scene)
+    speed = np.array([frame.momentum[0] for frame in frames]) / model.lattice.mass.sum()
     stick = given.get("friction_speed", 0.01 * SIDES.max())
     creep = (1 - np.sqrt(0.4)) * stick
     assert speed[61:].mean() == pytest.approx(creep / 20, rel=0.15)
@@ -356,7 +353,7 @@ def test_a_block_of_a_tenth_holds_below_the_angle_of_friction_and_slides_above_i
     mm/s."""
     angle = np.arctan(0.5) + np.radians(beyond)
     scene = {"cages": {"cell_size": 0.05}, "material": {"young_modulus": 1e6, "density": 1000.0}}
-    scene |= {"obstacle": [GROUND | {"friction": 0.5}], "time": {"step": 0.01, "duration": 1.0}}
+    scene |= {"obstacle": [ROUGH_GROUND], "time": {"step": 0.01, "duration": 1.0}}
     gravity = {"acceleration": [G * np.sin(angle), 0, -G * np.cos(angle)]}
     sides = np.array([0.1, 0.1, 0.1])
     model, frames = play(
@@ -375,60 +372,54 @@ def test_a_block_of_a_tenth_holds_below_the_angle_of_friction_and_slides_above_i
         assert x[-1] - x[0] == pytest.approx(acceleration / 2, rel=0.1)
 
 
-def test_a_block_slides_down_a_steep_slope_as_coulomb_says(tmp_path: Path):
-    v = slide(tmp_path, 1.0)[:, 0]
-    assert (v[-1] - v[20]) / (0.01 * (len(v) - 1 - 20)) == pytest.approx(
-        G * (1 - 0.5) / np.sqrt(2), rel=0.01
-    )
-
-
 # pressing force [N] over time [s]
 PRESSING = {"times": [0.0, 0.1, 0.2], "values": [[0, 0, 0], [0, 0, -600], [0, 0, -300]]}
+EVERYWHERE = {"half_space": {"point": [0, 0, -1], "normal": [0, 0, 1]}}
+PRESSED = [{"region": EVERYWHERE, "total": PRESSING}]
+
+
+def off_the_slide(model: Model, frames: list[Frame], mu: float, weight: float = 0.0) -> float:
+    """Return the error [m] of X + mu Z for a body that slides at 2 m/s, PRESSED.
+
+    X and Z are the displacements of the centre of mass. For any push N on a body of this weight [N]
+
+        M (x'' + mu z'') = mu (-N + N - F) = -mu F,        X + mu Z = v T - mu / M iint F.
+    """
+    mass, end = model.lattice.mass, frames[-1].time
+    X, _, Z = mass @ (frames[-1].position - model.lattice.nodes) / mass.sum()
+    fine = np.linspace(0, end, 20001)
+    force = np.interp(fine, PRESSING["times"], -np.array(PRESSING["values"])[:, 2]) + weight
+    way = float(((end - fine) * force).mean() * end)
+    return abs(X + mu * Z - 2.0 * end + mu / mass.sum() * way)
 
 
 def error_of_a_slide(folder: Path, t: float) -> float:
-    """Return the error [m] of X + mu Z for a block that slides at 2 m/s under a force.
-
-    X and Z are the displacements of the centre of mass. For any N
-
-        M (x'' + mu z'') = mu (-N + N - F) = -mu F,        X + mu Z = v T - mu / M iint F.
-
-    The ground is soft enough for the steps to resolve how the block sinks in.
-    """
+    """The ground is soft enough for the steps to resolve how the block sinks in."""
     mu, time = 0.2, {"step": t, "duration": 0.2, "integrator": "bdf2"}
     ground = GROUND | {"friction": mu, "stiffness": 2e3}
-    force = [
-        {"region": {"half_space": {"point": [0, 0, -1], "normal": [0, 0, 1]}}, "total": PRESSING}
-    ]
     scene = block_scene(
-        folder, time=time, force=force, obstacle=[ground], start={"velocity": [2.0, 0.0, 0.0]}
+        folder, time=time, force=PRESSED, obstacle=[ground], start={"velocity": [2.0, 0.0, 0.0]}
     )
     model, frames = play(scene)
     assert min(frame.momentum[0] for frame in frames) > MASS, "it never comes to rest"
-    X, _, Z = model.lattice.mass @ (frames[-1].position - model.lattice.nodes) / MASS
-    fine = np.linspace(0, 0.2, 20001)
-    pressed = np.interp(fine, PRESSING["times"], -np.array(PRESSING["values"])[:, 2])
-    return X + mu * Z - 0.2 * 2.0 + mu / MASS * float(((0.2 - fine) * pressed).mean() * 0.2)
+    return off_the_slide(model, frames, mu)
 
 
 def test_friction_under_a_push_that_changes_is_of_second_order_with_bdf2(tmp_path: Path):
-    errors = [abs(error_of_a_slide(tmp_path, t)) for t in (0.01, 0.005, 0.0025)]
+    errors = [error_of_a_slide(tmp_path, t) for t in (0.01, 0.005, 0.0025)]
     # the normal force of the start gives 3e-3 and orders of 0.9
     assert errors[0] < 3e-4
     assert np.log2(errors[0] / errors[1]) > 1.6 and np.log2(errors[1] / errors[2]) > 1.6
 
 
-PRESSING_PLANE = {
-    "shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty",
-    "friction": 0.8,
-    "path": [{"time": 1.0, "by": [0, 0, 0.3]}],
-}  # fmt: skip
+RISES = [{"time": 1.0, "by": [0, 0, 0.3]}]
+PRESSING_PLANE = plane_at(response="penalty", friction=0.8, path=RISES)
 # blocks that fall on the ground, slide a little and are pressed
 SLIDES = {
     "sides": np.array([6, 3, 3]) * CELL,
     "mesh": {"source": "scene.ply", "base": [0, 0, 0.01]},
     "start": {"velocity": [0.3, 0.0, -1.5]},
-    "gravity": {"acceleration": [0.0, 0.0, -9.81]},
+    "gravity": GRAVITY,
     "material": {"young_modulus": 1e5, "density": 1000.0},
     "time": {"step": 0.02, "duration": 0.2},
     "obstacle": [PRESSING_PLANE],
@@ -450,13 +441,12 @@ PUSH, PRESS_STOP, PRESS_T = 0.02, 0.8, 0.04
 
 
 def press(folder: Path, **tables) -> Path:
-    plate = {
-        "shape": "box",
-        "box": [[-1, -1, 0.5], [2, 2, 0.8]],
-        "path": [{"time": 0.4, "by": [0, 0, -PUSH]}],
-        "stop": PRESS_STOP,
-        "response": "penalty",
-    }
+    plate = box_at(
+        [[-1, -1, 0.5], [2, 2, 0.8]],
+        path=[{"time": 0.4, "by": [0, 0, -PUSH]}],
+        stop=PRESS_STOP,
+        response="penalty",
+    )
     time = {"step": PRESS_T, "duration": 1.6}
     return block_scene(folder, TALL, time=time, obstacle=[GROUND, plate], **tables)
 
@@ -558,12 +548,7 @@ def test_held_nodes_are_not_moved_by_what_strikes_them(tmp_path: Path, hold: str
     plane's speed."""
     bottom = {"region": {"box": [[0, 0, 0], [0.5, 0.5, 0.01]]}}
     prescribed = bottom | {"path": [{"time": 9.0, "by": [0, 0, 0]}]}
-    rising = {
-        "shape": "plane",
-        "point": [0, 0, -0.01],
-        "normal": [0, 0, 1],
-        "path": [{"time": 1.0, "by": [0, 0, 1]}],
-    }
+    rising = plane_at(-0.01, path=[{"time": 1.0, "by": [0, 0, 1]}])
     time = {"step": 0.01, "duration": 0.04}
     scene = block_scene(
         tmp_path, time=time, obstacle=[rising], **{hold: [bottom if hold == "pin" else prescribed]}

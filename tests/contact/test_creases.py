@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from block_scene import block_scene, play
+from block_scene import block_scene, play, solid_of
 from crossings import count_crossings
 
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw, ContactSets
@@ -139,7 +139,7 @@ def scene(folder: Path, **tables) -> Path:
     path = block_scene(
         folder,
         cages={"cell_size": 1 / 32},
-        material={"young_modulus": 1e5, "density": 1000.0, "law": "neo-hookean"},
+        material=solid_of(1e5),
         time={"step": 0.02, "duration": 0.4},
         pin=[{"region": {"box": [[0.3, 0, 0], [0.7, 1, 0.2]]} | half}],
         force=[

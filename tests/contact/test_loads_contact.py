@@ -12,45 +12,38 @@ from msmpetsc.scene.body import Region
 # box of sides 4, 2 and 1 m
 BOUNDS = np.array([[-1.0, 0.0, 2.0], [3.0, 2.0, 3.0]])
 
-
-def holds(region: dict, *points: list[float]) -> list[bool]:
-    return inside(Region.model_validate(region), np.array(points, float), BOUNDS).tolist()
-
-
-def test_box_absolute_and_relative():
-    box = {"box": [[0, 0, 0], [1, 1, 0.5]]}
-    assert holds(box, [0, 0, 0], [1, 1, 0.5], [0.5, 0.5, 0.51], [-0.01, 0.5, 0.2]) == [
-        True,
-        True,
-        False,
-        False,
-    ]
-    # relative: x from -1 to 3, y from 0 to 2, z from 2 to 2.5
-    points = [[-1, 0, 2], [3, 2, 2.5], [3.01, 1, 2.2], [0, 1, 2.51], [0.5, 0.5, 0.2]]
-    # at the body's own bounds in x, in y and below it is open outwards: cells stick out
-    # there
-    assert holds(box | {"relative": True}, *points) == [True, True, True, False, True]
-
-
-def test_sphere_absolute_and_relative():
-    ball = {"sphere": {"center": [0.5, 0.5, 0.5], "radius": 0.25}}
-    assert holds(ball, [0.5, 0.5, 0.75], [0.5, 0.25, 0.5], [0.7, 0.7, 0.5]) == [True, True, False]
-    # relative: centre at (1, 1, 2.5), the radius a quarter of the longest side, so 1;
-    # it stays round
-    points = [[2, 1, 2.5], [1, 2, 2.5], [1, 1, 1.5], [2.01, 1, 2.5], [1, 1, 3.51]]
-    assert holds(ball | {"relative": True}, *points) == [True, True, True, False, False]
+BOX = {"box": [[0, 0, 0], [1, 1, 0.5]]}
+SPHERE = {"sphere": {"center": [0.5, 0.5, 0.5], "radius": 0.25}}
+HALF_SPACE = {"half_space": {"point": [0, 0, 0.5], "normal": [0, 3, 4]}}
+# region, the points that it holds, and points that it does not hold
+REGIONS = [
+    (BOX, [[0, 0, 0], [1, 1, 0.5]], [[0.5, 0.5, 0.51], [-0.01, 0.5, 0.2]]),
+    # x from -1 to 3, y from 0 to 2, z from 2 to 2.5; open outwards at the body's own
+    # bounds in x, in y and below, where cells stick out
+    (
+        BOX | {"relative": True},
+        [[-1, 0, 2], [3, 2, 2.5], [3.01, 1, 2.2], [0.5, 0.5, 0.2]],
+        [[0, 1, 2.51]],
+    ),
+    (SPHERE, [[0.5, 0.5, 0.75], [0.5, 0.25, 0.5]], [[0.7, 0.7, 0.5]]),
+    # centre at (1, 1, 2.5), the radius a quarter of the longest side, so 1; it stays
+    # round
+    (
+        SPHERE | {"relative": True},
+        [[2, 1, 2.5], [1, 2, 2.5], [1, 1, 1.5]],
+        [[2.01, 1, 2.5], [1, 1, 3.51]],
+    ),
+    (HALF_SPACE, [[9, 0, 0.5], [0, 4, -2.5]], [[0, 4, -2.51], [0, -0.1, 0.5]]),
+    # the point is (-1, 0, 2.5), the normal is not scaled
+    (HALF_SPACE | {"relative": True}, [[0, 4, -0.5]], [[0, 4, -0.51]]),
+]
 
 
-def test_half_space_absolute_and_relative():
-    half = {"half_space": {"point": [0, 0, 0.5], "normal": [0, 3, 4]}}
-    assert holds(half, [9, 0, 0.5], [0, 4, -2.5], [0, 4, -2.51], [0, -0.1, 0.5]) == [
-        True,
-        True,
-        False,
-        False,
-    ]
-    # relative: the point is (-1, 0, 2.5), the normal is not scaled
-    assert holds(half | {"relative": True}, [0, 4, -0.5], [0, 4, -0.51]) == [True, False]
+@pytest.mark.parametrize(("region", "within", "beyond"), REGIONS)
+def test_a_region_holds_its_points_alone(region: dict, within: list, beyond: list):
+    points = np.array(within + beyond, float)
+    found = inside(Region.model_validate(region), points, BOUNDS)
+    assert found.tolist() == [True] * len(within) + [False] * len(beyond)
 
 
 def test_force_is_shared_out_by_mass():

@@ -5,9 +5,8 @@ from pathlib import Path
 import ipctk
 import numpy as np
 import pytest
-import tomli_w
 import trimesh
-from block_scene import play
+from block_scene import GRAVITY, play, solid_of, write_scene
 
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw
 from msmpetsc.contact.surface.places import CandidateSet
@@ -218,13 +217,12 @@ def test_cards_without_friction_stay_where_they_lie(tmp_path: Path):
             {"mesh": {"source": "card.ply", "base": [0, 0, 0.00619]}},
         ],
         "cages": {"cell_size": 0.006},
-        "material": {"young_modulus": 1e6, "density": 1000.0, "law": "neo-hookean"},
+        "material": solid_of(1e6),
         "time": {"step": 0.01, "duration": 0.03},
-        "gravity": {"acceleration": [0, 0, -9.81]},
+        "gravity": GRAVITY,
         "self_contact": {"distance": 2e-4, "friction": 0.0},
     }
-    (tmp_path / "scene.toml").write_text(tomli_w.dumps(tables))
-    model, frames = play(tmp_path / "scene.toml")
+    model, frames = play(write_scene(tmp_path, **tables))
     upper = model.lattice.nodes[:, 2] > 0.0061
     way = (frames[-1].position - frames[0].position)[upper].mean(axis=0)
     assert np.linalg.norm(way[:2]) < 5e-5 * 0.03

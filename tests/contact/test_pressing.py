@@ -7,22 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from block_scene import DENSITY, SIDES, G, block_scene, play
+from block_scene import DENSITY, GRAVITY, SIDES, G, block_scene, box_at, play, solid_of
 from test_obstacle_surfaces import crossed
 
 from msmpetsc.build import Model
 from msmpetsc.errors import StepFailed
 from msmpetsc.fields import Frame
 
-SOLID = {"young_modulus": 1e5, "density": DENSITY, "law": "neo-hookean", "poisson_ratio": 0.3}
+SOLID = solid_of(1e5, 0.3)
 STEP = 0.01
 HEIGHT = SIDES[2]
-FLOOR = {"shape": "box", "box": [[-0.3, -0.3, -0.1], [0.8, 0.8, -0.004]], "response": "barrier"}
-PLATE = {
-    "shape": "box",
-    "box": [[-0.3, -0.3, HEIGHT + 0.002], [0.8, 0.8, HEIGHT + 0.1]],
-    "response": "barrier",
-}
+FLOOR = box_at([[-0.3, -0.3, -0.1], [0.8, 0.8, -0.004]], response="barrier")
+PLATE = box_at([[-0.3, -0.3, HEIGHT + 0.002], [0.8, 0.8, HEIGHT + 0.1]], response="barrier")
 CENTER = [*SIDES[:2] / 2, HEIGHT + 0.002]
 WAYS = {
     "straight": {"by": [0, 0, -0.25 * HEIGHT]},
@@ -44,7 +40,7 @@ def pressed(
         "output": {},
         "obstacle": [FLOOR, plate],
     } | tables
-    scene = block_scene(folder, time=time, gravity={"acceleration": [0, 0, -G]}, **tables)
+    scene = block_scene(folder, time=time, gravity=GRAVITY, **tables)
     trimesh.creation.box(bounds=[[0, 0, 0], SIDES]).subdivide_to_size(edge).export(
         folder / "scene.ply"
     )
@@ -109,7 +105,7 @@ def test_a_paddle_that_goes_by_half_a_ball_a_step_hits_it(tmp_path: Path):
     out."""
     ball = trimesh.creation.icosphere(1, 0.1)
     ball.apply_translation([0.2, 0.14, 0])
-    paddle = {"shape": "box", "box": [[-0.3, -0.01, -0.2], [0.3, 0.01, 0.2]], "center": [0, 0, 0]}
+    paddle = box_at([[-0.3, -0.01, -0.2], [0.3, 0.01, 0.2]], center=[0, 0, 0])
     steps, step = 3, 0.002
     paddle |= {
         "response": "barrier",

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import trimesh
+from block_scene import box_at, plane_at
 
 import msmpetsc
 
@@ -28,10 +29,10 @@ def rolled(cells: int, response: str, step: float = 2.5e-3, duration: float = 0.
     ball.vertices *= (4 / 3 * np.pi * R**3 / ball.volume) ** (1 / 3)
     ball.vertices += [0, 0, -1e-5 - ball.vertices[:, 2].min()]
     slide = {"friction": FRICTION, "friction_speed": 1e-3}
-    plane = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "response": "penalty"}
+    plane = plane_at(response="penalty")
     contact: dict = {"obstacle": [plane | slide]}
     if response == "barrier":
-        board = {"shape": "box", "box": [[-0.5, -0.5, -0.2], [1.5, 0.5, -1e-4]]}
+        board = box_at([[-0.5, -0.5, -0.2], [1.5, 0.5, -1e-4]])
         contact = {"obstacle": [board | {"response": "barrier"}]}
         contact["self_contact"] = slide | {"distance": 2e-4}
     angle = np.arctan(SLOPE)

@@ -9,20 +9,18 @@ from types import SimpleNamespace
 import igl
 import numpy as np
 import pytest
-import tomli_w
 import trimesh
-from block_scene import block_scene, play
-from crossings import count_crossings
+from block_scene import GRAVITY, G, block_scene, model_of, play, solid_of, write_scene
+from crossings import count_crossings, crossings
 from mpi4py import MPI
 from pinch import ARM, HALF, RADIUS, pinch_scene, u_tube
 from stopped_runs import assert_goes_on_exactly
 
-from msmpetsc.build import Model, build_model
+from msmpetsc.build import Model
 from msmpetsc.contact.surface.pairs import CandidateCache, ContactSearch
 from msmpetsc.contact.surface.surface_contact import SMALL, SurfaceContact
 from msmpetsc.contact.surface.surface_friction import FrictionPairs, friction_pairs
 from msmpetsc.errors import InputError
-from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.simulate import refuse_bad_options
 
@@ -35,7 +33,7 @@ T = 0.01
 @pytest.fixture(scope="module")
 def model(tmp_path_factory) -> Model:
     tables = {"self_contact": {"distance": 1e-3, "friction": 0.5}}
-    return build_model(COMM, load_scene(pinch_scene(tmp_path_factory.mktemp("pinch"), **tables)))
+    return model_of(pinch_scene(tmp_path_factory.mktemp("pinch"), **tables))
 
 
 def closed(model: Model) -> np.ndarray:
@@ -183,25 +181,18 @@ def test_the_way_ends_before_surfaces_meet_however_far_it_goes(model):
 
 
 # otherwise the ends of the arms turn inside out
-SOLID = {
-    "young_modulus": 1e5,
-    "density": 1000,
-    "law": "neo-hookean",
-}
+SOLID = solid_of(1e5)
 
 
 def test_arms_that_close_do_not_cross(tmp_path):
     path = pinch_scene(tmp_path, material=SOLID, time={"step": 0.01, "duration": 0.11})
     model, frames = play(path)
-    triangles = model.surface.triangles
-    assert sum(count_crossings(frame.surface, triangles) for frame in frames) == 0
+    assert crossings(model, frames) == 0
     assert 0 < np.nanmin([frame.self_distance for frame in frames]) < 1e-3
     text = path.read_text()
     path.write_text(text[: text.index("[self_contact]")])
     without = play(path)[1]
-    assert count_crossings(without[-1].surface, triangles) > 0 and np.isnan(
-        without[-1].self_distance
-    )
+    assert crossings(model, without[-1:]) > 0 and np.isnan(without[-1].self_distance)
 
 
 def test_a_run_that_goes_on_from_a_checkpoint_is_the_same_to_the_last_bit(tmp_path):
@@ -225,7 +216,7 @@ def crossing_boxes(folder: Path, deep: float, subdivisions: int) -> Path:
 
 def test_triangles_that_cut_others_at_rest_are_left_out_and_named(tmp_path, caplog):
     path = crossing_boxes(tmp_path, 0.01, 4)
-    model = build_model(COMM, load_scene(path))
+    model = model_of(path)
     assert "triangles cut others at rest, the first at (" in caplog.text
     surface = model.collision.surface
     assert 0 < len(surface.triangles) < len(model.surface.triangles)
@@ -237,13 +228,13 @@ def test_a_surface_that_cuts_itself_all_over_is_refused(tmp_path):
     path = pinch_scene(tmp_path)
     trimesh.util.concatenate([u_tube(), u_tube(around=15, along=57)]).export(tmp_path / "u.ply")
     with pytest.raises(InputError, match=r"self_contact: .* cut others at rest.*union.*repair"):
-        build_model(COMM, load_scene(path))
+        model_of(path)
 
 
 def test_a_coarser_surface_lies_on_the_body_says_how_far_it_is_off_and_pushes_from_there(
     tmp_path, caplog
 ):
-    model = build_model(COMM, load_scene(pinch_scene(tmp_path, self_contact={"surface": 400})))
+    model = model_of(pinch_scene(tmp_path, self_contact={"surface": 400}))
     surface, whole = model.collision.surface, model.surface.points
     assert 300 < len(surface.triangles) <= 400
     squares = igl.point_mesh_squared_distance(surface.points, whole, model.surface.triangles)[0]
@@ -259,12 +250,8 @@ def test_a_coarser_surface_lies_on_the_body_says_how_far_it_is_off_and_pushes_fr
     assert np.median(off) > 3e-4 * diagonal
     caplog.clear()
     far = {"surface": 400, "distance": 1.01 * off.max()}
-    assert (
-        build_model(
-            COMM, load_scene(pinch_scene(tmp_path, self_contact=far))
-        ).collision.law.distance
-        > off.max()
-    )
+    model = model_of(pinch_scene(tmp_path, self_contact=far))
+    assert model.collision.law.distance > off.max()
     assert "the surface drawn" not in caplog.text
 
 
@@ -293,54 +280,41 @@ def test_presets_of_a_are_refused(tmp_path):
         refuse_bad_options(scene)
 
 
-def sliding(folder: Path, angle: float, **given: float) -> Path:
-    """Scene of a block that falls onto a plate of the same mesh, all seen as tilted by an angle
-    [degrees]."""
-    cell, g, tilt = 1 / 16, 9.81, np.radians(angle)
-    plate = (
-        trimesh.creation.box(bounds=[[0, 0, 0], [1.5, 0.375, cell]])
-        .subdivide()
-        .subdivide()
-        .subdivide()
-    )
+@pytest.mark.slow
+def test_a_block_holds_on_a_tilted_one(tmp_path: Path):
+    """It gives way once in the 20 steps for which that is remembered, as far as it would in each,
+    were it not.
+
+    The block falls onto a plate of the same mesh, all seen as tilted by 20 degrees.
+    """
+    cell, tilt = 1 / 16, np.radians(20.0)
+    plate = trimesh.creation.box(bounds=[[0, 0, 0], [1.5, 0.375, cell]])
     block = trimesh.creation.box(bounds=[[0.125, 0.09375, 3 * cell], [0.375, 0.28125, 6 * cell]])
     path = block_scene(
-        folder,
+        tmp_path,
         cages={"cell_size": cell},
-        material={"young_modulus": 1e6, "density": 1000.0, "law": "neo-hookean"},
+        material=solid_of(1e6),
         time={"step": 0.01, "duration": 0.7},
-        gravity={"acceleration": [g * np.sin(tilt), 0.0, -g * np.cos(tilt)]},
+        gravity={"acceleration": [G * np.sin(tilt), 0.0, -G * np.cos(tilt)]},
         pin=[{"region": {"box": [[-1, -1, -1], [2, 1, 1.5 * cell]]}}],
         solver={"preset": "newton", "error": 1e-4},
-        self_contact={"distance": 0.003, "friction": 0.5} | given,
+        self_contact={"distance": 0.003, "friction": 0.5},
     )
-    trimesh.util.concatenate([plate, block.subdivide().subdivide()]).export(folder / "scene.ply")
-    return path
-
-
-def along_and_frames(path: Path) -> tuple[np.ndarray, list[Frame]]:
-    """Speed [m/s] of the block down the plate in each step from the 51st on, at rest on it, and
-    these frames."""
+    fine = [plate.subdivide().subdivide().subdivide(), block.subdivide().subdivide()]
+    trimesh.util.concatenate(fine).export(tmp_path / "scene.ply")
     model, frames = play(path)
-    free = model.lattice.nodes[:, 2] > 2 / 16
-    mass = model.lattice.mass * free
+    mass = model.lattice.mass * (model.lattice.nodes[:, 2] > 2 * cell)
     along = np.array([mass @ frame.position[:, 0] for frame in frames]) / mass.sum()
-    return np.diff(along)[50:] / 0.01, frames[51:]
-
-
-@pytest.mark.slow
-def test_a_block_holds_on_a_tilted_one(tmp_path):
-    """It gives way once in the 20 steps for which that is remembered, as far as it would in each,
-    were it not."""
-    speed, frames = along_and_frames(sliding(tmp_path, 20.0))
+    # of the block down the plate in each step from the 51st on, at rest on it [m/s]
+    speed = np.diff(along)[50:] / 0.01
     # stick speed [m/s], by the longest side of the two equal meshes
     stick = 1e-2 * 1.5
-    creep = stick * (1 - np.sqrt(1 - np.tan(np.radians(20.0)) / 0.5))
+    creep = stick * (1 - np.sqrt(1 - np.tan(tilt) / 0.5))
     # friction starts anew once in steps 51 to 70
     assert speed.mean() == pytest.approx(creep / 20, rel=0.3)
     assert abs(speed[:9].mean()) < 0.01 * creep
     # a step starts from the end of the last step, not in free flight
-    assert max(frame.iterations for frame in frames) <= 8
+    assert max(frame.iterations for frame in frames[51:]) <= 8
 
 
 def test_a_pair_of_edges_is_the_same_whichever_is_found_first():
@@ -387,18 +361,12 @@ def test_blocks_of_long_triangles_touch_at_their_corners_and_say_so(tmp_path: Pa
                 {"mesh": {"source": "cube.ply", "prepare": steps, "base": [0, 0, 1.002]}},
             ],
             "cages": {"cell_size": 0.125},
-            "material": {
-                "young_modulus": 1e5,
-                "density": 1000.0,
-                "law": "neo-hookean",
-                "damping": 20.0,
-            },
+            "material": solid_of(1e5, damping=20.0),
             "time": {"step": 0.05, "duration": 0.5},
-            "gravity": {"acceleration": [0, 0, -9.81]},
+            "gravity": GRAVITY,
             "self_contact": {"distance": 1e-3},
         }
-        (tmp_path / "scene.toml").write_text(tomli_w.dumps(tables))
-        model, frames = play(tmp_path / "scene.toml")
+        model, frames = play(write_scene(tmp_path, **tables))
         top = model.lattice.nodes[:, 2] > 2.0
         sunk.append((model.lattice.nodes - frames[-1].position)[top, 2].mean())
     assert sunk[1] == pytest.approx(sunk[2], rel=0.01) and 0.1 < sunk[1] < 0.8 * sunk[0]

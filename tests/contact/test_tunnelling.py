@@ -4,11 +4,10 @@ energy of both."""
 import re
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 import trimesh
-from block_scene import STIFFEST, block_scene, play
+from block_scene import GRAVITY, STIFFEST, block_scene, box_at, plane_at, play
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -105,7 +104,7 @@ def against_a_plate(
     """A plate of a hundredth of a cell 0.1 m under a block that falls on it, or that it comes up
     to; no gravity."""
     steps = 10 + int(np.ceil(0.4 / speed / STEP))
-    plate = {"shape": "box", "box": [[-9, -9, -0.10125], [9, 9, -0.1]], "response": response}
+    plate = box_at([[-9, -9, -0.10125], [9, 9, -0.1]], response=response)
     start = {}
     if moving:
         plate["path"] = [{"time": 1.0, "by": [0, 0, speed]}]
@@ -161,61 +160,23 @@ def test_to_and_from_a_moving_frame_nothing_changes(tmp_path: Path, integrator: 
 
 def test_a_body_rests_on_a_plate_thinner_than_its_push_is_deep(tmp_path: Path):
     """Every node at the bottom lies below the far face, for good."""
-    floor = {
-        "shape": "box",
-        "box": [[-9, -9, -1e-6], [9, 9, 0]],
-        "response": "penalty",
-        "friction": 0.5,
-    }
+    floor = box_at([[-9, -9, -1e-6], [9, 9, 0]], response="penalty", friction=0.5)
     time = {"step": 0.05, "duration": 2.0}
-    _, frames = play(
-        block_scene(
-            tmp_path, BLOCK, time=time, gravity={"acceleration": [0, 0, -9.81]}, obstacle=[floor]
-        )
-    )
+    _, frames = play(block_scene(tmp_path, BLOCK, time=time, gravity=GRAVITY, obstacle=[floor]))
     depth = np.maximum(-frames[-1].position[:, 2], 0)
     assert depth.max() > 1e-4
     assert 10 * STIFFEST * depth.sum() == pytest.approx(1000 * BLOCK.prod() * 9.81, rel=1e-4)
 
 
-def test_ranks_agree_on_thin_plates(msmpetsc, tmp_path: Path):
-    """A plate pushes from below, a second plate reflects nodes of some ranks from the side.
-
-    Positions and known energies agree. A third plate has nodes inside. A single rank reports them,
-    and not again on resuming.
-    """
-    time = {"step": 0.002, "duration": 0.046, "integrator": "bdf2"}
-    pushing = {
-        "shape": "box",
-        "box": [[-9, -9, -0.02], [9, 9, -0.019]],
-        "response": "penalty",
-        "friction": 0.3,
-    }
-    pushing |= {"path": [{"time": 1.0, "by": [0, 0, 3.0]}]}
-    wall = {
-        "shape": "box",
-        "box": [[-0.012, -9, -9], [-0.011, 9, 9]],
-        "path": [{"time": 1.0, "by": [3.0, 0, 0]}],
-    }
-    inside = {"shape": "box", "box": [[0.9, -1, -1], [2, 0.05, 0.05]]}
-    obstacles = [pushing, wall, inside]
-    path = block_scene(
-        tmp_path, np.array([1.0, 0.25, 0.25]), time=time, obstacle=obstacles, material=STIFF
-    )
-    _, frames = play(path)
-    done = msmpetsc(2, "run", path, "-o", tmp_path / "o.h5", "--set", "time.duration=0.04")
-    assert done.returncode == 0 and done.stderr.count("1 node inside obstacle.2") == 1, done.stderr
-    more = ("--set", "time.duration=0.046", "--force")
-    done = msmpetsc(2, "run", "--resume", tmp_path / "o.h5", *more)
-    assert done.returncode == 0 and "inside obstacle" not in done.stderr, done.stderr
-    with h5py.File(tmp_path / "o.h5") as file:
-        np.testing.assert_allclose(
-            file["frames/position"][:], [frame.position for frame in frames], atol=1e-7
-        )
-        gained = [frame.energy_gained for frame in frames]
-        np.testing.assert_allclose(
-            file["frames/energy_gained"][:], gained, atol=1e-5 * totals(frames).max()
-        )
+def test_ranks_tell_nodes_that_begin_inside_once_and_not_on_going_on(msmpetsc, tmp_path: Path):
+    inside = box_at([[0.2, -1, -1], [2, 0.05, 0.05]])
+    # up to a checkpoint
+    time = {"step": 0.002, "duration": 0.04}
+    path, out = block_scene(tmp_path, BLOCK, time=time, obstacle=[inside]), tmp_path / "o.h5"
+    done = msmpetsc(2, "run", path, "-o", out, status=0)
+    assert done.stderr.count("1 node inside obstacle.0") == 1
+    done = msmpetsc(2, "run", "--resume", out, "--set", "time.duration=0.044", "--force", status=0)
+    assert "inside obstacle" not in done.stderr
 
 
 def test_a_step_whose_nodes_cannot_be_settled_fails_in_words(tmp_path: Path, monkeypatch):
@@ -227,18 +188,9 @@ def test_a_step_whose_nodes_cannot_be_settled_fails_in_words(tmp_path: Path, mon
 def test_nodes_that_come_in_by_another_face_each_time_a_step_is_solved_settle(tmp_path: Path):
     """A plate that comes edge first meets a fast body by its corner, out of a larger run of random
     boxes."""
-    plate = {
-        "shape": "box",
-        "box": [[-1.481, 2.832, 0.2023], [1.519, 5.832, 0.2523]],
-        "response": "penalty",
-    }
+    plate = box_at([[-1.481, 2.832, 0.2023], [1.519, 5.832, 0.2523]], response="penalty")
     plate["path"] = [{"time": 0.05, "by": [0.89, -7.54, 0.155]}]
-    around = {
-        "shape": "box",
-        "box": [[-1.75, -1.46, 0.1771], [1.249, 1.54, 0.4771]],
-        "start": 0.01,
-        "stop": 0.03,
-    }
+    around = box_at([[-1.75, -1.46, 0.1771], [1.249, 1.54, 0.4771]], start=0.01, stop=0.03)
     time = {"step": 0.005, "duration": 0.05, "integrator": "bdf2"}
     tables = {
         "material": STIFF | {"young_modulus": 3.5e6},
@@ -270,13 +222,9 @@ def totals(frames) -> np.ndarray:
 
 
 def test_bdf2_does_not_sink_into_what_gives_nothing_back(tmp_path: Path):
-    floor = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1], "restitution": 0}
+    floor = plane_at(restitution=0)
     time = {"step": 0.005, "duration": 1.0, "integrator": "bdf2"}
-    _, frames = play(
-        block_scene(
-            tmp_path, BLOCK, time=time, gravity={"acceleration": [0, 0, -9.81]}, obstacle=[floor]
-        )
-    )
+    _, frames = play(block_scene(tmp_path, BLOCK, time=time, gravity=GRAVITY, obstacle=[floor]))
     lowest = [frame.position[:, 2].min() for frame in frames]
     assert min(lowest) > -0.005 and abs(lowest[-1] - lowest[100]) < 1e-3
 
@@ -286,7 +234,7 @@ def test_bdf2_does_not_sink_into_what_gives_nothing_back(tmp_path: Path):
 def test_the_work_of_a_moving_obstacle_is_counted(tmp_path: Path, integrator: str, response: str):
     """A plane that strikes a ball at rest: verlet with ``reflect`` used to end at once, having
     "gained" it all."""
-    floor = {"shape": "plane", "point": [0, 0, -0.53], "normal": [0, 0, 1], "response": response}
+    floor = plane_at(-0.53, response=response)
     floor["path"] = [{"time": 1.0, "by": [0, 0, 20.0]}]
     time = {"step": 0.001, "duration": 0.08, "integrator": integrator}
     _, frames = play(ball(tmp_path, time=time, obstacle=[floor]))
@@ -308,7 +256,7 @@ def test_energy_from_nowhere_is_told_once_with_its_frame(
     It gives 4% of a ball's energy at steps of 1 ms. The report is a share of the body's energy, not
     of the exchanged energy.
     """
-    floor = {"shape": "plane", "point": [0, 0, -0.6], "normal": [0, 0, 1], "response": "exchange"}
+    floor = plane_at(-0.6, response="exchange")
     scene = {
         "start": {"velocity": [0, 0, -10.0]},
         "obstacle": [floor],
@@ -344,14 +292,9 @@ def test_nodes_that_begin_inside_are_told_with_number_depth_and_place(
 ):
     """A block 0.25 m high, of 3 x 3 x 3 nodes, half under the ground; the tops of two pins do not
     count."""
-    ground = {"shape": "plane", "point": [0, 0, 0.2], "normal": [0, 0, 1], "response": "exchange"}
-    high = {"shape": "box", "box": [[-1, -1, 9], [1, 1, 10]], "response": "penalty"}
-    late = {
-        "shape": "box",
-        "box": [[-1, -1, -1], [0.1, 1, 1]],
-        "response": "penalty",
-        "start": 0.02,
-    }
+    ground = plane_at(0.2, response="exchange")
+    high = box_at([[-1, -1, 9], [1, 1, 10]], response="penalty")
+    late = box_at([[-1, -1, -1], [0.1, 1, 1]], response="penalty", start=0.02)
     pin = [{"region": {"sphere": {"center": [0, 0, 0], "radius": 0.01}}}]
     time = {"step": 0.01, "duration": 0.04}
     path = block_scene(tmp_path, BLOCK, time=time, obstacle=[high, ground, late], pin=pin)

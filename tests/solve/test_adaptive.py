@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import GRAVITY, block_scene, clamped_beam, play
+from block_scene import GRAVITY, block_scene, clamped_beam, plane_at, play, solid_of
 from failing_steps import Failing
 from one_process import input_error
 
@@ -105,7 +105,7 @@ def test_the_estimate_of_a_bar_two_cells_across_that_is_let_go(tmp_path: Path, s
     """
     tables = {
         "start": start,
-        "material": {"law": "neo-hookean", "young_modulus": 1e5, "density": 1e3},
+        "material": solid_of(1e5),
         "solver": {"preset": "newton", "error": 1e-5},
         "output": {"surface": False, "every": 1},
     }
@@ -123,15 +123,7 @@ LANDING = {
     "mesh": {"source": "scene.ply", "base": [0, 0, 0.005]},
     "start": {"velocity": [0.3, 0.0, -0.5]},
     "gravity": GRAVITY,
-    "obstacle": [
-        {
-            "shape": "plane",
-            "point": [0, 0, 0],
-            "normal": [0, 0, 1],
-            "response": "penalty",
-            "friction": 0.5,
-        }
-    ],
+    "obstacle": [plane_at(response="penalty", friction=0.5)],
     "force": [
         {
             "region": {"half_space": {"point": [0, 0, -1], "normal": [0, 0, 1]}},
@@ -155,7 +147,7 @@ def test_the_error_reached_where_a_penalty_pushes_is_the_error_asked(tmp_path: P
 
 def ball(folder: Path, **tables) -> Path:
     """A block that falls, and is thrown back by the ground after 0.1 s."""
-    ground = {"shape": "plane", "point": [0, 0, -0.05], "normal": [0, 0, 1], "response": "reflect"}
+    ground = plane_at(-0.05, response="reflect")
     time = {"step": 0.01, "duration": 0.15, "integrator": "bdf2", "error": 2e-2}
     return block_scene(
         folder, gravity=GRAVITY, obstacle=[ground], time=time, solver=LOOSE, **tables

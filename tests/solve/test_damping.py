@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import block_scene, play
+from block_scene import block_scene, play, solid_of
 
 from msmpetsc.errors import InputError
 
@@ -69,7 +69,7 @@ def test_a_swing_loses_its_energy_as_the_exponential(tmp_path: Path, integrator:
     assert "nowhere" not in caplog.text
 
 
-SOLID = {"young_modulus": 1e6, "density": 1000.0, "law": "neo-hookean"}
+SOLID = solid_of(1e6)
 # retardation time [s]
 RETARDATION = 0.1
 

@@ -6,28 +6,20 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from block_scene import GRAVITY, block_scene
+from block_scene import GRAVITY, block_scene, box_at, loop_of, plane_at, solid_of
 from conftest import run
 from lattices import COMM, T, beam, one_spring, weight
-from mpi4py import MPI
 from one_process import assert_one_line
 
 from msmpetsc.backend.arrays import Rows
-from msmpetsc.build import build_model
-from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.instrumentation import TrueErrors
 from msmpetsc.solve.nonlinear import error_control
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 from msmpetsc.solve.presets import PRESETS, find_preset
-from msmpetsc.solve.simulate import TimeLoop
 
-FLOOR = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1]}
-PLATE = {
-    "shape": "box",
-    "box": [[-1, -1, 0.26], [2, 2, 0.5]],
-    "path": [{"time": 0.2, "by": [0, 0, -0.1]}],
-}
+FLOOR = plane_at()
+PLATE = box_at([[-1, -1, 0.26], [2, 2, 0.5]], path=[{"time": 0.2, "by": [0, 0, -0.1]}])
 SCENES = {
     "leaps": {
         "time": {"step": 0.005, "duration": 0.15},
@@ -36,7 +28,7 @@ SCENES = {
     },
     "is pressed": {
         "time": {"step": 0.01, "duration": 0.2},
-        "material": {"young_modulus": 1e5, "density": 1000.0, "law": "neo-hookean"},
+        "material": solid_of(1e5),
         "obstacle": [
             FLOOR | {"response": "penalty", "friction": 0.5},
             PLATE | {"response": "penalty"},
@@ -65,12 +57,9 @@ def test_the_estimate_is_within_three_of_the_true_error(
         return result
 
     monkeypatch.setattr(Stepper, "step", estimated)
-    scene = load_scene(
-        block_scene(tmp_path, gravity=GRAVITY, **SCENES[name]),
-        [f"solver={{preset='{preset}', error=1e-3}}"],
-    )
-    model = build_model(MPI.COMM_SELF, scene)
-    with TimeLoop(MPI.COMM_SELF, scene, model, true_error=1) as simulation:
+    scene = block_scene(tmp_path, gravity=GRAVITY, **SCENES[name])
+    solver = f"solver={{preset='{preset}', error=1e-3}}"
+    with loop_of(scene, solver, true_error=1) as simulation:
         stepper = simulation.integrator.stepper
         errors = np.array(
             [
@@ -89,12 +78,8 @@ def test_with_multigrid_a_proof_is_cheap(tmp_path: Path, law: str):
     """A share of 0.6 of all products proved these steps when each estimate was made anew."""
     scene = SCENES["swings"] | {"material": {"young_modulus": 5e5, "density": 1000.0, "law": law}}
     solver = "solver={preset='newton-multigrid', error=1e-3}"
-    loaded = load_scene(
-        block_scene(tmp_path, gravity=GRAVITY, **scene), [solver, "cages={cell_size=0.05}"]
-    )
-    with TimeLoop(
-        MPI.COMM_SELF, loaded, build_model(MPI.COMM_SELF, loaded), true_error=1
-    ) as simulation:
+    path = block_scene(tmp_path, gravity=GRAVITY, **scene)
+    with loop_of(path, solver, "cages={cell_size=0.05}", true_error=1) as simulation:
         frames = [frame for frame in simulation.frames() if frame.index]
     assert min(frame.step_error / frame.true_error for frame in frames) > 0.99
     assert max(frame.step_error for frame in frames) <= 1e-3
@@ -108,7 +93,7 @@ def test_newtons_linear_solves_tell_the_error(tmp_path: Path):
     """With PETSc's own test of convergence, the errors need solves of their own."""
     words = ["--frames", "12", "--true-error", "1", "--error", "1e-3"]
     # |F| says little of the error of a stiff body
-    stiff = {"young_modulus": 1e7, "density": 1000.0, "law": "neo-hookean"}
+    stiff = solid_of(1e7)
     scene = SCENES["swings"] | {"material": stiff}
     path, products = block_scene(tmp_path, gravity=GRAVITY, **scene), []
     for options in ([], ["-ksp_convergence_test", "default"]):
@@ -206,8 +191,7 @@ def test_an_estimate_does_not_trust_a_cycle_that_smooths_nothing(tmp_path: Path)
     tables = {
         "cages": {"cell_size": 0.0015}, "time": {"integrator": "static"}, "gravity": GRAVITY,
         "pin": held,
-        "material": {"young_modulus": 1e9, "poisson_ratio": 0.0, "density": 1000.0,
-        "law": "neo-hookean"},
+        "material": solid_of(1e9, 0.0),
         "solver": {"preset": "newton-multigrid"},
     }  # fmt: skip
     scene, out = block_scene(tmp_path, np.array([0.1, 0.02, 0.001]), **tables), tmp_path / "o.h5"

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import h5py
 import pytest
-from block_scene import block_scene, play
+from block_scene import GRAVITY, block_scene, plane_at, play
 from conftest import run as on_ranks
 
 FRAMES = 3
 SWINGS = {
-    "gravity": {"acceleration": [0, 0, -9.81]},
+    "gravity": GRAVITY,
     "pin": [{"region": {"box": [[0, 0, 0], [0.01, 1, 1]], "relative": True}}],
     "time": {"step": 1 / 60, "duration": FRAMES / 60},
     "solver": {"preset": "newton", "error": 1e-6},
@@ -72,7 +72,7 @@ def test_events_are_in_their_stages(run: tuple):
 
 @pytest.mark.slow
 def test_ghosts_and_contact_are_told_on_two_ranks(tmp_path: Path):
-    floor = {"shape": "plane", "point": [0, 0, 0.01], "normal": [0, 0, 1], "response": "penalty"}
+    floor = plane_at(0.01, response="penalty")
     words = block_scene(tmp_path, **SWINGS, obstacle=[floor]), "-o", tmp_path / "o.h5", "-log_view"
     done = on_ranks(2, "-m", "msmpetsc", "run", *words, status=0)
     steps = logged(done.stdout)["steps"]

@@ -11,13 +11,12 @@ from pathlib import Path
 import block_scene as blocks
 import numpy as np
 import pytest
-import tomli_w
 import trimesh
-from conftest import ROOT, python
+from block_scene import GRAVITY, loop_of, plane_at
+from conftest import ROOT, run
 from lattices import T, chain
 from mpi4py import MPI
 
-from msmpetsc.build import build_model
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
@@ -25,19 +24,11 @@ from msmpetsc.solve.nonlinear.curvature import ALIKE, Alarm
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import find_preset
-from msmpetsc.solve.simulate import TimeLoop
 
 BEAM, CUBE = [1, 0.2, 0.2], [1, 1, 1]
-GRAVITY = {"acceleration": [0, 0, -9.81]}
 PLATES = [
-    {
-        "shape": "plane",
-        "point": [0, 0, -0.11],
-        "normal": [0, 0, 1],
-        "response": "penalty",
-        "friction": 0.3,
-    },
-    {"shape": "plane", "point": [0, 0, 0.1], "normal": [0, 0, -1], "response": "penalty"},
+    plane_at(-0.11, response="penalty", friction=0.3),
+    plane_at(0.1, -1, response="penalty"),
 ]
 CASES = {
     "crushed": dict(
@@ -68,16 +59,13 @@ def write_case(folder: Path, name: str, **solver) -> Path:
         "solver": {"error": 1e-3} | solver,
         "output": {"surface": False},
     }
-    path = folder / f"{name}.toml"
-    path.write_text(tomli_w.dumps(scene | case))
-    return path
+    return blocks.write_scene(folder, name, **scene | case)
 
 
 def play(path: Path, *overrides: str) -> list[Frame]:
     """The frames, true errors measured, until the end or a step that fails."""
-    scene, frames = load_scene(path, overrides), []
-    model = build_model(MPI.COMM_SELF, scene)
-    with TimeLoop(MPI.COMM_SELF, scene, model, true_error=1) as simulation, suppress(StepFailed):
+    frames = []
+    with loop_of(path, *overrides, true_error=1) as simulation, suppress(StepFailed):
         frames.extend(simulation.frames())
     return frames[1:]
 
@@ -113,9 +101,7 @@ def test_a_budget_that_ends_where_no_minimum_is_near_says_so(tmp_path: Path):
 
 
 def squashed(tmp_path: Path, share: float) -> tuple[Stepper, np.ndarray]:
-    path = write_case(tmp_path, "crushed")
-    scene = load_scene(path, [f"start.scale=[1, 1, {share}]"])
-    simulation = TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene))
+    simulation = loop_of(write_case(tmp_path, "crushed"), f"start.scale=[1, 1, {share}]")
     return simulation, simulation.state.q
 
 
@@ -228,20 +214,13 @@ def test_parts_that_are_as_good_as_rigid_are_refused_at_once(
 
 def error_study(*words: object) -> str:
     """Return the output of scripts/error_study.py."""
-    done = python("-W", "ignore", ROOT / "scripts" / "error_study.py", *words)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
+    return run(1, ROOT / "scripts" / "error_study.py", *words, status=0).stdout
 
 
 def shares_said(seed: int, number: int, *changes: str) -> list[float]:
     """Return the reported over the true error of each step of a scene."""
-    printed = error_study(
-        "--seed",
-        seed,
-        "--only",
-        number,
-        *(word for change in changes for word in ("--set", change)),
-    )
+    more = [word for change in changes for word in ("--set", change)]
+    printed = error_study("--seed", seed, "--only", number, *more)
     return [error / true for error, true in json.loads(printed)["steps"]]
 
 
@@ -315,13 +294,9 @@ def test_a_preconditioner_far_from_the_hessian_bounds_no_error(tmp_path: Path):
             "spin": [-38.34936159106727, -267.39473131613147, -109.9781407748381],
             "velocity": [-2.3607346401851053, 5.561076327491708, 5.703682468065478],
         },
-        "obstacle": [
-            {"shape": "plane", "point": [0, 0, -0.3], "normal": [0, 0, 1], "response": "reflect"}
-        ],
+        "obstacle": [plane_at(-0.3, response="reflect")],
         "solver": {"preset": "newton", "error": 0.3},
         "output": {"surface": False},
     }
-    path = tmp_path / "spins.toml"
-    path.write_text(tomli_w.dumps(scene))
-    frames = play(path)
+    frames = play(blocks.write_scene(tmp_path, **scene))
     assert len(frames) == 2 and all(frame.true_error < 3 * frame.step_error for frame in frames)

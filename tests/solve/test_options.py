@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import block_scene
+from block_scene import GRAVITY, block_scene
 from conftest import ENVIRONMENT, python, run
 from lattices import beam, swing, weight
 from mpi4py import MPI
-from one_process import assert_one_line, command_error, input_error
+from one_process import NOISE, assert_one_line, command_error, input_error
 
 from msmpetsc.app.ranks import ALONE
 from msmpetsc.cli.command_table import COMMANDS
@@ -27,7 +27,7 @@ COMM = MPI.COMM_SELF
 # a scene in motion
 SCENE = {
     "time": {"step": 0.01, "duration": 0.02},
-    "gravity": {"acceleration": [0, 0, -9.81]},
+    "gravity": GRAVITY,
     "pin": [{"region": {"box": [[-1, -1, 0.9], [2, 2, 2]], "relative": True}}],
 }
 COMMAND = ("-m", "msmpetsc.cli.main", "run")
@@ -108,6 +108,7 @@ BEFORE_THE_MESH = {
     "-python": "-python",
     "-fp_trap": "not finite",
 }
+MULTIGRID = "--preset newton-multigrid --set cages.cell_size=0.0625 "
 WITH_THE_SOLVERS = {
     "-ts_dt 1": "-ts_dt",
     "-ksp_rtol abc": "abc",
@@ -119,6 +120,21 @@ WITH_THE_SOLVERS = {
     "--set time.integrator=static -pc_type composite": "composite",
     "--set time.integrator=static -pc_type shell": "apply",
     "--set time.integrator=verlet -ksp_type cg": "-ksp_type",
+    "--preset anderson -pc_type mg": "newton's presets",
+    MULTIGRID + "-pc_mg_levels 1": "nearest for this lattice is 2",
+    MULTIGRID + "-pc_mg_levels 9": "nearest for this lattice is",
+    MULTIGRID + "-pc_mg_galerkin both": "PETSc cannot set up the solver",
+    MULTIGRID + "-mg_levels_pc_type nonsense": "nonsense",
+    MULTIGRID + "-mg_levels_1_pc_type redistribute": "finest level",
+}
+# options of multigrid's cycle that go together, and the effect that shows
+OBEYED = {
+    "-pc_mg_levels 2 -mg_levels_ksp_max_it 2 -mg_coarse_pc_type cholesky "
+    "-ksp_view": "MULTIPLICATIVE, levels=2",
+    "-pc_mg_levels 3 -pc_mg_cycle_type w -matptap_via scalable -pc_mg_log "
+    "-log_view": "MGSmooth Level 1",
+    "-pc_mg_type additive -mg_coarse_redundant_pc_type lu": "",
+    "-pc_mg_type full -mg_levels_ksp_type richardson": "",
 }
 
 
@@ -159,6 +175,16 @@ def test_an_error_within_petsc_is_one_line_and_no_crash_when_the_process_ends(
     assert_one_line(done, 2, WITH_THE_SOLVERS[options])
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("ranks", [1, 2])
+@pytest.mark.parametrize("options", OBEYED)
+def test_options_of_the_cycle_are_obeyed(tmp_path: Path, options: str, ranks: int):
+    scene, words = block_scene(tmp_path, **SCENE), (MULTIGRID + options).split()
+    done = run(ranks, *COMMAND, scene, "-o", tmp_path / "o.h5", *words, status=0)
+    assert OBEYED[options] in done.stdout
+    assert not any(noise in done.stdout + done.stderr for noise in NOISE)
+
+
 # collects garbage as often as Python can
 COLLECTING = """
 import gc, sys
@@ -185,16 +211,8 @@ def test_a_process_ends_with_its_error_though_python_has_left_petsc_an_object(
 ):
     """The traceback holds a PC of type python, which PETSc destroyed once Python was no more."""
     scene = block_scene(tmp_path, **SCENE)
-    done = python(
-        "-m",
-        "msmpetsc",
-        "run",
-        scene,
-        "-o",
-        tmp_path / "o.h5",
-        *options.split(),
-        env=ENVIRONMENT | ALONE,
-    )
+    words = [*COMMAND, scene, "-o", tmp_path / "o.h5", *options.split()]
+    done = python(*words, env=ENVIRONMENT | ALONE)
     assert_one_line(done, 2, "PETSc")
     done = python("-c", FRAMES, scene, options, env=ENVIRONMENT | ALONE)
     assert done.returncode == 1 and "PETSC ERROR" not in done.stderr, done.stderr
@@ -293,11 +311,6 @@ def test_the_reason_says_which_rule_ended_the_step(preset: str):
         assert reason in ({reasons.CONVERGED_ITS} if budget else by_error)
         seen.add(reason)
     assert seen >= {reasons.CONVERGED_SNORM_RELATIVE, reasons.CONVERGED_ITS}
-
-
-def test_a_solver_that_tries_the_hessian_when_it_is_set_up_has_one(petsc_options):
-    petsc_options(ksp_type="chebyshev")
-    assert all(result.cost.step_error <= 1e-3 for result in swing("newton", 2, error=1e-3))
 
 
 @pytest.mark.parametrize("preset", PRESETS)

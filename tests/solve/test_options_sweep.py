@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from block_scene import GRAVITY, block_scene
+from block_scene import GRAVITY, block_scene, plane_at
 from conftest import HANGS, run
 from mpi4py import MPI
 
@@ -22,7 +22,7 @@ from msmpetsc.cli.main import main
 from msmpetsc.solve.petsc.initialise import finalise, start_for_runs
 
 PINNED = [{"region": {"box": [[-1, -1, 0.9], [2, 2, 2]], "relative": True}}]
-FLOOR = [{"shape": "plane", "point": [0, 0, -0.001], "normal": [0, 0, 1], "response": "penalty"}]
+FLOOR = [plane_at(-0.001, response="penalty")]
 MOVES = {"time": {"step": 0.01, "duration": 0.01}, "gravity": GRAVITY}
 # tables of scenes, and options that make the objects
 SCENES = {

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from block_scene import block_scene
+from block_scene import GRAVITY, block_scene, loop_of
 from conftest import ROOT
 from crossings import count_crossings
 from mpi4py import MPI
@@ -351,11 +351,8 @@ def test_what_anderson_cannot_do_is_rescued(how: str, changes: list[str]):
 
 def test_a_checkpoint_of_a_rescued_run_goes_on_where_nothing_is_rescued(tmp_path):
     """--force takes another safety.on_failure: there its halvings and its tally mean nothing."""
-    path = block_scene(
-        tmp_path, time={"step": 0.01, "duration": 0.02}, gravity={"acceleration": [0.0, 0.0, -9.81]}
-    )
-    scene = load_scene(path)
-    with TimeLoop(MPI.COMM_SELF, scene, build_model(MPI.COMM_SELF, scene)) as simulation:
+    path = block_scene(tmp_path, time={"step": 0.01, "duration": 0.02}, gravity=GRAVITY)
+    with loop_of(path) as simulation:
         saved = simulation.saved
         saved.numbers |= {"Recovery.level": 3, "Recovery.recovered": 2}
         simulation.restore(saved)

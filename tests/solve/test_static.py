@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import DENSITY, YOUNG, G, block_scene, play
+from block_scene import YOUNG, G, block_scene, plane_at, play
 from lattices import COMM, one_spring
 from one_process import input_error
 
@@ -56,16 +56,6 @@ def test_a_mass_hangs_on_a_spring(preset: str):
     assert end == pytest.approx(r + m * G / k, rel=1e-9)
 
 
-def test_a_hanging_bar(tmp_path: Path):
-    """rho g L^2 / (2 E) longer, but for the layer that the pins keep from narrowing: less than 2%
-    here."""
-    scene = column(tmp_path, pin=[{"region": TOP}], gravity={"acceleration": [0.0, 0.0, -0.1]})
-    model, frames = play(scene)
-    bottom = model.lattice.nodes[:, 2] < 0.01
-    longer = -(frames[-1].position - model.lattice.nodes)[bottom, 2].mean()
-    assert longer == pytest.approx(DENSITY * 0.1 * COLUMN[2] ** 2 / (2 * YOUNG), rel=0.02)
-
-
 def test_states_under_forces_that_come_and_go(tmp_path: Path):
     """A state for each time. States under the same loads are the same and cost nothing."""
     states = {"step": 1.0, "duration": 6.0, "integrator": "static"}
@@ -89,13 +79,7 @@ def test_anchors_lead_from_state_to_state_and_let_go(tmp_path: Path):
 
 def test_an_obstacle_presses(tmp_path: Path):
     """k d of all nodes that it holds is the weight, where the body is but guided from the side."""
-    plane = {
-        "shape": "plane",
-        "point": [0, 0, 0.01],
-        "normal": [0, 0, 1],
-        "response": "penalty",
-        "stiffness": 1e3,
-    }
+    plane = plane_at(0.01, response="penalty", stiffness=1e3)
     guide = [{"region": TOP, "path": [{"time": 1.0, "by": [0.0, 0.0, 0.0]}]}]
     model, frames = play(column(tmp_path, anchor=guide, obstacle=[plane]))
     bottom = model.lattice.nodes[:, 2] < 0.01
@@ -117,7 +101,7 @@ def test_a_body_that_may_turn_or_move_is_refused(tmp_path: Path, tables: dict, w
     assert words in input_error(lambda: play(scene))
 
 
-PLANE = {"shape": "plane", "point": [0, 0, 0], "normal": [0, 0, 1]}
+PLANE = plane_at()
 OF_MOTION = {
     "no velocity": {"start": {"velocity": [0.0, 0.0, 1.0]}},
     "gradient or swirl": {"start": {"gradient": [[0, 1, 0]] * 3}},

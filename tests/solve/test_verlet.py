@@ -5,24 +5,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import CELL, G, block_scene, play
+from block_scene import CELL, GRAVITY, G, block_scene, loop_of, plane_at, play, solid_of
 from lattices import block, cages_of, dense_hessian, one_spring
 from mpi4py import MPI
 
-from msmpetsc.build import Model, build_model
+from msmpetsc.build import Model
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
 from msmpetsc.fields import Frame
 from msmpetsc.lattice.lattice import Lattice, build_lattice
 from msmpetsc.scene.body import Material
-from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.integrators import verlet
 from msmpetsc.solve.integrators.integrator import State
 from msmpetsc.solve.integrators.verlet import Verlet
-from msmpetsc.solve.simulate import TimeLoop
 
 T = 1 / 60
 COMM = MPI.COMM_SELF
@@ -106,7 +104,7 @@ def test_free_flight_keeps_momentum_and_angular_momentum():
 
 BEAM = {
     "sides": CELL * np.array([8, 2, 2]),
-    "gravity": {"acceleration": [0, 0, -G]},
+    "gravity": GRAVITY,
     "pin": [{"region": {"box": [[-1, -1, -1], [0.01, 1, 1]]}}],
 }
 
@@ -182,8 +180,8 @@ def test_a_substep_beyond_the_limit_is_shortened_and_a_shorter_one_kept(tmp_path
 @pytest.mark.parametrize("response", ["reflect", "penalty"])
 def test_a_blow_that_stiffens_the_body_is_taken_in_shorter_substeps(tmp_path: Path, response: str):
     """A soft block, thrown down: omega at the impact is more than twice that of the flight."""
-    floor = {"shape": "plane", "point": [0, 0, -0.05], "normal": [0, 0, 1], "response": response}
-    material = {"young_modulus": 1e4, "density": 1000.0, "law": "neo-hookean"}
+    floor = plane_at(-0.05, response=response)
+    material = solid_of(1e4)
     time = {"step": T, "duration": 0.4} | EXPLICIT
     scene = block_scene(
         tmp_path, time=time, material=material, gravity={"acceleration": [0, 0, -2 * G]},
@@ -250,9 +248,7 @@ def test_the_work_of_an_anchor_that_lets_go_is_no_energy_from_nowhere(tmp_path: 
     ]
     anchor = [{"region": top, "path": path, "stop": stop * T}]
     time = {"step": T, "duration": 9 * T, "substep": 1e-4} | EXPLICIT
-    _, frames = play(
-        block_scene(tmp_path, time=time, anchor=anchor, gravity={"acceleration": [0, 0, -G]})
-    )
+    _, frames = play(block_scene(tmp_path, time=time, anchor=anchor, gravity=GRAVITY))
     assert frames[6].kinetic + frames[6].elastic > 0.1
     assert max(frame.energy_gained for frame in frames) < 3e-3 * frames[6].kinetic
 
@@ -263,13 +259,7 @@ TILT = 0.3
 
 def on_a_slope(folder: Path, friction: float, **time) -> Path:
     """A block on a plane, with gravity tilted."""
-    floor = {
-        "shape": "plane",
-        "point": [0, 0, 0],
-        "normal": [0, 0, 1],
-        "response": "penalty",
-        "friction": friction,
-    }
+    floor = plane_at(response="penalty", friction=friction)
     gravity = {"acceleration": [G * np.sin(TILT), 0, -G * np.cos(TILT)]}
     return block_scene(folder, gravity=gravity, obstacle=[floor], time=time)
 
@@ -282,11 +272,9 @@ def settled(folder: Path, friction: float) -> tuple[Path, State]:
 
 
 def go_on(scene: Path, state: State, steps: int) -> tuple[Model, list[Frame]]:
-    scene = load_scene(scene, (VERLET, f"time.step={T}", f"time.duration={steps * T}"))
-    model = build_model(COMM, scene)
-    with TimeLoop(COMM, scene, model) as simulation:
+    with loop_of(scene, VERLET, f"time.step={T}", f"time.duration={steps * T}") as simulation:
         simulation.state = state
-        return model, list(simulation.frames())
+        return simulation.model, list(simulation.frames())
 
 
 def test_a_block_sticks_to_a_slope_below_the_angle_of_friction(tmp_path: Path):

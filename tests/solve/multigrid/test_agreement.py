@@ -4,19 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import CELL, block_scene, play
+from block_scene import CELL, block_scene, plane_at, play
 
 ERROR, STEPS, STEP = 1e-6, 6, 0.01
 HELD = [{"region": {"box": [[0, 0, 0], [0.05, 1, 1]], "relative": True}}]
 FAR = {"box": [[0.95, 0, 0], [1, 1, 1]], "relative": True}
 LED = [{"region": FAR, "path": [{"time": 4 * STEP, "by": [0.05, 0, 0.05]}], "stop": 5 * STEP}]
-FLOOR = {
-    "shape": "plane",
-    "point": [0, 0, -0.01],
-    "normal": [0, 0, 1],
-    "response": "penalty",
-    "friction": 0.4,
-}
+FLOOR = plane_at(-0.01, response="penalty", friction=0.4)
 FALLING = {"start": {"velocity": [0.5, 0, -1.5]}, "obstacle": [FLOOR]}
 SOFT = {"young_modulus": 1e5, "density": 1000.0}
 TIME = {"step": STEP, "duration": STEPS * STEP}

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import scipy.sparse as sparse
-from block_scene import play
+from block_scene import play, solid_of
 from mpi4py import MPI
 from petsc4py import PETSc
 from pinch import pinch_scene
@@ -107,7 +107,7 @@ def test_the_coarsest_matrix_has_the_whole_contact_and_finer_levels_their_blocks
     without.destroy()
 
 
-SOLID = {"young_modulus": 1e5, "density": 1000, "law": "neo-hookean"}
+SOLID = solid_of(1e5)
 
 
 def test_contact_that_joins_nodes_takes_a_part_of_the_iterations_to_the_same_frames(

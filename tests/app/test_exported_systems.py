@@ -15,10 +15,12 @@ from block_scene import (
     block_scene,
     clamped_beam,
     half_space,
+    loop_of,
+    model_of,
     roller,
+    solid_of,
 )
 from conftest import ROOT, python, run
-from mpi4py import MPI
 from one_process import command_error
 from petsc4py import PETSc
 from pinch import pinch_scene
@@ -27,12 +29,9 @@ from scipy.sparse.linalg import spsolve
 from study_files import own_log  # noqa: F401 (a fixture)
 
 import msmpetsc
-from msmpetsc.build import build_model
-from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.linear.assembled_hessian import assembled, blocks_of
-from msmpetsc.solve.simulate import TimeLoop
 
-SOLID = {"law": "neo-hookean", "young_modulus": 1e5, "density": 1000.0, "poisson_ratio": 0.3}
+SOLID = solid_of(1e5, 0.3)
 SWING = {"step": 0.05, "duration": 0.15}
 LINEAR = {"material": {"law": "linear", "young_modulus": 1e5, "density": 1000.0}}
 # of the matrix and of CG, well above rounding and below any term that may be lacking
@@ -80,7 +79,7 @@ def test_a_system_solves_to_the_steps_own_correction(tmp_path: Path, law: str):
     y = spsolve(hessian.tocsc(), right)
     with h5py.File(result) as file:
         position = file["frames/position"][2]
-        free = ~build_model(MPI.COMM_SELF, load_scene(path)).lattice.pinned
+        free = ~model_of(path).lattice.pinned
     began = vector(folder, "coordinates")
     moved = np.abs(y).max()
     assert moved > 1e-3, "a step that hardly moves tests nothing"
@@ -139,9 +138,7 @@ def test_the_matrix_multiplies_as_the_products_do(tmp_path: Path, tables: dict, 
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * np.abs(expected).max())
         checked.append((bool(hessian.contact and hessian.contact.parts), bool(hessian.surface)))
 
-    scene = load_scene(bodies(tmp_path, **tables))
-    model = build_model(MPI.COMM_SELF, scene)
-    with TimeLoop(MPI.COMM_SELF, scene, model, system_monitor=check) as loop:
+    with loop_of(bodies(tmp_path, **tables), system_monitor=check) as loop:
         for _ in loop.frames():
             pass
     assert checked
@@ -159,7 +156,7 @@ def test_rigid_modes_are_those_of_the_free_body(tmp_path: Path):
     msmpetsc.run(path, tmp_path / "x.h5", frames=1, export=tmp_path, quiet=True)
     folder = tmp_path / "step_1"
     hessian = matrix(folder / "hessian.bin")
-    mass = np.repeat(build_model(MPI.COMM_SELF, load_scene(path)).lattice.mass, 3)
+    mass = np.repeat(model_of(path).lattice.mass, 3)
     modes = vectors(folder / "rigid_modes.bin", 6)
     np.testing.assert_allclose(modes @ modes.T, np.eye(6), atol=1e-12)
     stiff = np.abs(hessian.diagonal()).max()
@@ -209,7 +206,7 @@ def test_a_held_component_has_its_diagonal_alone(tmp_path: Path):
     folder = tmp_path / "step_1"
     hessian, right = matrix(folder / "hessian.bin"), vector(folder, "residual")
     with h5py.File(result) as file:
-        lattice = build_model(MPI.COMM_SELF, load_scene(path)).lattice
+        lattice = model_of(path).lattice
         begun = file["frames/position"][0]
     free = ~lattice.pinned
     held = lattice.fixed[free].ravel()

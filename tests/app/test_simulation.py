@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import DENSITY, G, block_scene
+from block_scene import DENSITY, GRAVITY, G, block_scene
 from conftest import ENVIRONMENT, python, run
 
 import msmpetsc as msm
 from msmpetsc.app.ranks import ALONE
 from msmpetsc.errors import InputError, StepFailed
 
-FALL = {"gravity": {"acceleration": [0, 0, -G]}, "time": {"step": 0.01, "duration": 0.03}}
+FALL = {"gravity": GRAVITY, "time": {"step": 0.01, "duration": 0.03}}
 HELD = {"pin": [{"region": {"box": [[-1, -1, -1], [0.01, 2, 2]]}}]}
 INTEGRATORS = ("implicit-euler", "bdf2", "verlet")
 

@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import block_scene
-from one_process import command_error
+from block_scene import GRAVITY, block_scene
+from one_process import command_error, status_of
 
-from msmpetsc.cli.main import main
 from msmpetsc.results.baseline import Numbers, Recipe, allowed, judged, read
 
 STEPS = 3
@@ -18,22 +17,12 @@ STEPS = 3
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A block on its way down, and its stored numbers."""
     folder = tmp_path_factory.mktemp("own")
-    fall = {"time": {"step": 0.01, "duration": 1.0}, "gravity": {"acceleration": [0, 0, -9.81]}}
+    fall = {"time": {"step": 0.01, "duration": 1.0}, "gravity": GRAVITY}
     path = block_scene(
         folder, **fall, pin=[{"region": {"half_space": {"point": [0, 0, 0], "normal": [0, 0, -1]}}}]
     )
     assert (
-        main(
-            [
-                "check",
-                "--update",
-                str(path),
-                "--frames",
-                str(STEPS),
-                "--set",
-                "material.density=900.0",
-            ]
-        )
+        status_of("check", "--update", path, "--frames", STEPS, "--set", "material.density=900.0")
         == 0
     )
     return path
@@ -65,7 +54,7 @@ def test_the_numbers_say_how_they_were_made(numbers: Path):
 
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_the_same_scene_has_the_same_numbers_on_any_ranks(scene: Path, ranks: int, capfd):
-    assert main(["check", str(scene), "--ranks", str(ranks)]) == 0
+    assert status_of("check", scene, "--ranks", ranks) == 0
     assert capfd.readouterr().out.endswith(" same\n")
 
 
@@ -77,7 +66,7 @@ def test_what_differs_is_named(scene: Path, numbers: Path, capfd):
     )
     stored["counts"]["pinned"] += 1
     numbers.write_text(json.dumps(stored))
-    assert main(["check", str(scene), "--json"]) == 1
+    assert status_of("check", scene, "--json") == 1
     shown = json.loads(capfd.readouterr().out)
     wrong = shown["differences"][str(scene)]
     assert not shown["same"] and [line.partition(":")[0] for line in wrong] == ["elastic", "pinned"]
@@ -90,7 +79,7 @@ def test_a_scene_that_fails_is_named_and_the_others_are_checked(
     alone = tmp_path / "alone.toml"
     alone.write_text(scene.read_text())
     alone.with_suffix(".baseline.json").write_text(numbers.read_text())
-    assert main(["check", str(alone), str(scene)]) == 1
+    assert status_of("check", alone, scene) == 1
     out = capfd.readouterr().out
     assert (
         "alone                FAILED\n" in out
@@ -105,8 +94,8 @@ def test_a_changed_scene_differs_until_its_numbers_are_stored_anew(
     text, before = scene.read_text(), json.loads(numbers.read_text())
     scene.write_text(text.replace("young_modulus = 100000.0", "young_modulus = 100010.0"))
     try:
-        assert scene.read_text() != text and main(["check", str(scene)]) == 1
-        assert main(["check", "--update", str(scene)]) == 0
+        assert scene.read_text() != text and status_of("check", scene) == 1
+        assert status_of("check", "--update", scene) == 0
     finally:
         scene.write_text(text)
     out, after = capfd.readouterr().out, json.loads(numbers.read_text())

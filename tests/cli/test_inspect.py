@@ -11,10 +11,10 @@ import pytest
 from block_scene import DENSITY, YOUNG, block_scene
 from conftest import ROOT, WORKERS, python, run
 from mpi4py import MPI
+from one_process import status_of
 
 from msmpetsc.build import Geometry, build_model, fill_cages, read_bodies
 from msmpetsc.cli.commands.inspect import BYTES, MOST_BUILT
-from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.partition_counts import Partition, count_partition
@@ -112,10 +112,10 @@ def test_a_scene_too_large_to_build_is_scaled_and_says_so(scene: Path, capsys, m
     many = "cages={count = 800000, max_cells = 100000}"
     with pytest.raises(InputError, match=r"more than cages\.max_cells"):
         fill_cages(read_bodies(SELF, load_scene(scene)), load_scene(scene, [many]))
-    assert main(["inspect", str(scene), "--ranks", "8", "--set", many]) == 0
+    assert status_of("inspect", scene, "--ranks", "8", "--set", many) == 0
     told = capsys.readouterr()
     assert "scaled from a lattice of" in told.out and "run refuses 800000 cells" in told.err
-    assert main(["inspect", str(scene), "--set", "cages={cell_size = 0.02}"]) == 0
+    assert status_of("inspect", scene, "--set", "cages={cell_size = 0.02}") == 0
     (cells,) = [
         line.split()[1] for line in capsys.readouterr().out.splitlines() if line.startswith("cells")
     ]
@@ -151,7 +151,7 @@ def test_a_body_thinner_than_a_cell_is_told_with_the_cells_that_would_do(
         material={"young_modulus": YOUNG, "density": DENSITY, "law": law},
         time={"step": 0.01, "duration": 0.1},
     )  # fmt: skip
-    assert main(["inspect", str(strip)]) == 0
+    assert status_of("inspect", strip) == 0
     told = capsys.readouterr()
     words = re.search(r"bends by about (.*) of theory: cages.count = (\d+) or (.*) makes", told.err)
     assert (words is not None) == (bending is not None)

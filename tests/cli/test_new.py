@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import ROOT, python
-from one_process import command_error
+from one_process import command_error, status_of
 from surfaces import surface_of
 
 import msmpetsc
 from msmpetsc.cli.commands.new import SURER, measured, unit_of, uprightness
-from msmpetsc.cli.main import main
 from msmpetsc.geometry.surface import examine
 from msmpetsc.scene.key_table import SCHEMA_FILE, json_schema
 from msmpetsc.scene.reading import load_scene
@@ -64,7 +63,7 @@ def test_new_takes_z_for_upwards_or_what_is_said(suffix, words, up, tmp_path, mo
     monkeypatch.chdir(tmp_path)
     trimesh.creation.box([0.1, 0.2, 0.1]).export(f"box.{suffix}")
     with caplog.at_level("INFO", logger="msmpetsc"):
-        assert main(["new", "my.toml", "--mesh", f"box.{suffix}", *words]) == 0
+        assert status_of("new", "my.toml", "--mesh", f"box.{suffix}", *words) == 0
     assert f"{up} is taken for upwards" in caplog.text
     assert "the file is taken to be in m, its longest side as 0.2 m" in caplog.text
     turns = [step for step in load_scene("my.toml").mesh.prepare if "rotate" in step]
@@ -106,7 +105,7 @@ def test_a_first_scene_runs_at_once(name: str, tmp_path: Path, monkeypatch, caps
     if name == "inwards":
         mesh.invert()
     mesh.export(f"{name}.stl")
-    assert main(["new", "my.toml", "--mesh", f"{name}.stl"]) == 0
+    assert status_of("new", "my.toml", "--mesh", f"{name}.stl") == 0
     assert "msmpetsc run my.toml" in capsys.readouterr().out
     text = Path("my.toml").read_text()
     assert text.startswith(f"#:schema {SCHEMA_FILE}\n") and words in text
@@ -115,7 +114,7 @@ def test_a_first_scene_runs_at_once(name: str, tmp_path: Path, monkeypatch, caps
     assert [kind for kind in ("obstacle", "pin") if getattr(scene, kind)] == tables
     size = scene.mesh.size
     assert size is not None and 0.01 < size < 1
-    assert main(["run", "my.toml", "-o", "my.h5", "--set", "cages.count=150", "--quiet"]) == 0
+    assert status_of("run", "my.toml", "-o", "my.h5", "--set", "cages.count=150", "--quiet") == 0
     with msmpetsc.open("my.h5") as run:
         moved = np.linalg.norm(run.frames.position[-1] - run.lattice.nodes[:], axis=1).max()
         fallen = 0.2 * size if tables == ["obstacle"] else 0.05 * size
@@ -127,7 +126,7 @@ def test_what_is_found_of_a_mesh_is_said(tmp_path: Path, monkeypatch, capsys):
     box = trimesh.creation.box([0.1, 0.1, 0.1])
     box.invert()
     trimesh.util.concatenate([box, box.copy().apply_translation([0.3, 0, 0])]).export("two.ply")
-    assert main(["new", "two.toml", "--mesh", "two.ply"]) == 0
+    assert status_of("new", "two.toml", "--mesh", "two.ply") == 0
     told = capsys.readouterr().err
     assert (
         "24 triangles, closed, 2 parts, the largest of 50% of the area" in told
@@ -135,7 +134,7 @@ def test_what_is_found_of_a_mesh_is_said(tmp_path: Path, monkeypatch, capsys):
     )
     hole = trimesh.Trimesh(box.vertices, box.faces[2:], process=False)
     hole.export("open.ply")
-    assert main(["new", "open.toml", "--mesh", "open.ply"]) == 0
+    assert status_of("new", "open.toml", "--mesh", "open.ply") == 0
     assert "warning: open.ply: the mesh is open (4 boundary edges)" in capsys.readouterr().err
     cubes = [
         trimesh.creation.box(bounds=[[at, at, 0], [at + 0.1, at + 0.1, 0.1]]) for at in (0, 0.1)
@@ -143,7 +142,7 @@ def test_what_is_found_of_a_mesh_is_said(tmp_path: Path, monkeypatch, capsys):
     joined = trimesh.util.concatenate(cubes)
     joined.merge_vertices()
     joined.export("edge.ply")
-    assert main(["new", "edge.toml", "--mesh", "edge.ply"]) == 0
+    assert status_of("new", "edge.toml", "--mesh", "edge.ply") == 0
     assert "warning: edge.ply: 1 edges have more than two triangles" in capsys.readouterr().err
 
 
@@ -166,15 +165,15 @@ def test_what_cannot_be_written_is_refused_in_one_line(tmp_path: Path, ball: Pat
     assert sorted(os.listdir()) == ["ball.ply", "flat.ply"]
     Path("my.toml").write_text("mine")
     assert (
-        main(["new", "my.toml", "--mesh", "ball.ply"]) == 2
+        status_of("new", "my.toml", "--mesh", "ball.ply") == 2
         and Path("my.toml").read_text() == "mine"
     )
-    assert main(["new", "my.toml", "--mesh", "ball.ply", "--overwrite"]) == 0
+    assert status_of("new", "my.toml", "--mesh", "ball.ply", "--overwrite") == 0
 
 
 def test_a_shipped_scene_is_copied_as_it_is(tmp_path: Path, capsys):
-    assert main(["new", "--list"]) == 0 and "bunny_fall " in capsys.readouterr().out
-    assert main(["new", str(tmp_path / "my.toml"), "--from", "bunny_fall"]) == 0
+    assert status_of("new", "--list") == 0 and "bunny_fall " in capsys.readouterr().out
+    assert status_of("new", tmp_path / "my.toml", "--from", "bunny_fall") == 0
     shipped = (ROOT / "scenes" / "bunny_fall.toml").read_text()
     assert (tmp_path / "my.toml").read_text() == f"#:schema {SCHEMA_FILE}\n{shipped}"
 
@@ -221,7 +220,7 @@ def test_commands_that_are_shown_can_be_pasted(tmp_path: Path, capsys):
     """Names with blanks are quoted."""
     scene, mesh = tmp_path / "my scene.toml", tmp_path / "my box.ply"
     trimesh.creation.box([0.1, 0.2, 0.1]).export(mesh)
-    assert main(["new", str(scene), "--mesh", str(mesh)]) == 0
+    assert status_of("new", scene, "--mesh", mesh) == 0
     command = capsys.readouterr().out.splitlines()[-1].removeprefix("to run it: ")
     assert shlex.split(command) == ["msmpetsc", "run", str(scene), "--picture"]
     told = command_error("run", mesh, "-o", tmp_path / "x.h5").partition("no scene: ")[2]

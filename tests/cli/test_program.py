@@ -9,14 +9,14 @@ import sys
 from pathlib import Path
 
 import pytest
-from block_scene import DENSITY, YOUNG, block_scene
+from block_scene import YOUNG, block_scene, solid_of
 from conftest import ENVIRONMENT, python
-from one_process import command_error
+from one_process import command_error, status_of
 
 from msmpetsc.backend import kernel_cache
 from msmpetsc.cli.command_table import COMMANDS
 from msmpetsc.cli.commands import doctor
-from msmpetsc.cli.main import main, parsed
+from msmpetsc.cli.main import parsed
 
 ONCE = {"step": 0.01, "duration": 0.01}
 
@@ -68,7 +68,7 @@ def test_steps_longer_than_the_slowest_vibration_are_warned_of(tmp_path: Path, c
     for step, integrator, said in ((0.7, "bdf2", 1), (0.5, "bdf2", 0), (0.7, "verlet", 0)):
         time = {"step": step, "duration": step, "integrator": integrator}
         scene = block_scene(tmp_path, time=time, gravity={"acceleration": [0, 0, -1]})
-        assert main(["run", str(scene), "-o", str(tmp_path / "x.h5"), "--overwrite"]) == 0
+        assert status_of("run", scene, "-o", tmp_path / "x.h5", "--overwrite") == 0
         assert (
             capsys.readouterr().err.count(
                 "warning: time.step is 1.1 periods of the slowest vibration"
@@ -79,17 +79,17 @@ def test_steps_longer_than_the_slowest_vibration_are_warned_of(tmp_path: Path, c
 
 def test_quiet_says_nothing_and_verbose_when_and_where(tmp_path: Path, capsys):
     # a solid: two cells of springs across would be told to be thin
-    solid = {"young_modulus": YOUNG, "density": DENSITY, "law": "neo-hookean"}
+    solid = solid_of(YOUNG)
     scene = str(block_scene(tmp_path, time=ONCE, material=solid))
-    assert main(["run", scene, "-o", str(tmp_path / "q.h5"), "--quiet"]) == 0
+    assert status_of("run", scene, "-o", tmp_path / "q.h5", "--quiet") == 0
     assert capsys.readouterr() == ("", "")
-    assert main(["run", scene, "-o", str(tmp_path / "v.h5"), "--verbose"]) == 0
+    assert status_of("run", scene, "-o", tmp_path / "v.h5", "--verbose") == 0
     notes = [line for line in capsys.readouterr().err.splitlines() if "note" in line]
     assert notes and all(line.startswith("msmpetsc: note [") and " ms]: " in line for line in notes)
-    assert main(["run", scene, "-o", str(tmp_path / "v.h5"), "--verbose"]) == 2
+    assert status_of("run", scene, "-o", tmp_path / "v.h5", "--verbose") == 2
     shown = capsys.readouterr().err
     assert "Traceback" in shown and "InputError" in shown, "where the refusal arose"
-    assert main(["run", scene, "-o", str(tmp_path / "v.h5"), "--quiet", "--verbose"]) == 2
+    assert status_of("run", scene, "-o", tmp_path / "v.h5", "--quiet", "--verbose") == 2
     assert "not allowed with" in capsys.readouterr().err
 
 
@@ -163,13 +163,13 @@ def test_what_a_program_reads_is_one_json_object(tmp_path: Path, capsys):
     )
     files = [str(tmp_path / f"{name}.h5") for name in "ab"]
     for file, frames in zip(files, "21", strict=True):
-        assert main(["run", scene, "-o", file, "--frames", frames, "--quiet"]) == 0
-    assert main(["compare", files[0], files[0], "--json"]) == 0
+        assert status_of("run", scene, "-o", file, "--frames", frames, "--quiet") == 0
+    assert status_of("compare", files[0], files[0], "--json") == 0
     same = json.loads(capsys.readouterr().out)
     assert same["agree"] and same["frames"] == 3 and same["fields"]["position"]["error"] == 0
-    assert main(["compare", *files, "--json"]) == 1
+    assert status_of("compare", *files, "--json") == 1
     assert json.loads(capsys.readouterr().out)["agree"] is False, "one lacks a frame"
-    assert main(["inspect", scene, "--ranks", "2", "--json"]) == 0
+    assert status_of("inspect", scene, "--ranks", "2", "--json") == 0
     shown = json.loads(capsys.readouterr().out)
     assert shown["counts"]["cells"]["all"] == 32 and shown["counts"]["cells"]["mean"] == 16
     assert 2 * 0.29e9 < shown["memory"]["all"] < 2 * 0.31e9

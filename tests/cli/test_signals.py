@@ -12,6 +12,7 @@ from pathlib import Path
 import h5py
 import pytest
 from conftest import ENVIRONMENT, python
+from one_process import status_of
 from stopped_runs import (  # noqa: F401  # a fixture
     EVERY,
     STEPS,
@@ -32,7 +33,7 @@ STATUS = {signal.SIGUSR1: 0, signal.SIGTERM: 143, signal.SIGINT: 130}
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Never stopped."""
     folder = tmp_path_factory.mktemp("whole")
-    assert main(["run", str(hanging(folder)), "-o", str(folder / "whole.h5")]) == 0
+    assert status_of("run", hanging(folder), "-o", folder / "whole.h5") == 0
     return folder / "whole.h5"
 
 
@@ -44,7 +45,7 @@ def test_a_signal_ends_the_step_and_the_run_goes_on_exactly(
     with monkeypatch.context() as patch:
         # the signal comes between frames
         signal_after(patch, 10, number)
-        assert main(["run", str(whole.parent / "scene.toml"), "-o", str(path)]) == STATUS[number]
+        assert status_of("run", whole.parent / "scene.toml", "-o", path) == STATUS[number]
     told = (
         f"stopped by {number.name} after step 10 of 40 (t = 0.1 s); to go on: msmpetsc run "
         f"--resume {path}\n"
@@ -53,7 +54,7 @@ def test_a_signal_ends_the_step_and_the_run_goes_on_exactly(
     assert signal.getsignal(number) == handler
     with h5py.File(path) as file:
         assert finished(file) == 4 and max(file["checkpoint/step"]) == 10
-    assert main(["run", "--resume", str(path)]) == 0
+    assert status_of("run", "--resume", path) == 0
     assert_same(path, whole)
     assert sorted(os.listdir(tmp_path)) == ["x.h5", "x.xdmf"]
 
@@ -80,7 +81,7 @@ def test_stopped_again_and_again(whole: Path, tmp_path, monkeypatch):
 def test_a_signal_in_the_last_step_comes_too_late(whole: Path, tmp_path, monkeypatch, capsys):
     signal_after(monkeypatch, STEPS, signal.SIGTERM)
     path = tmp_path / "x.h5"
-    assert main(["run", str(whole.parent / "scene.toml"), "-o", str(path)]) == 0
+    assert status_of("run", whole.parent / "scene.toml", "-o", path) == 0
     assert "stopped" not in capsys.readouterr().err
     assert_same(path, whole)
 
@@ -146,7 +147,7 @@ def test_a_signal_ends_a_step_of_minutes_between_its_iterations(tmp_path, ranks:
         "-snes_linesearch_type",
         "bt",
     ]
-    assert main(["run", "--resume", str(path), "--force", *able]) == 0
+    assert status_of("run", "--resume", path, "--force", *able) == 0
 
 
 def test_a_second_interrupt_stops_at_once(tmp_path):

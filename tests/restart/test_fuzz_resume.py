@@ -10,9 +10,9 @@ import pytest
 from bad_input import TRIALS, damage, damaged, limits
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from one_process import status_of
 from stopped_runs import hanging, signal_after
 
-from msmpetsc.cli.main import main
 from msmpetsc.solve import simulate
 
 NAMES = [
@@ -37,7 +37,7 @@ def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulate, "REMEMBERED", 4)
         signal_after(patch, 4, signal.SIGUSR1)
-        assert main(["run", str(hanging(folder, steps=6)), "-o", str(folder / "x.h5")]) == 0
+        assert status_of("run", hanging(folder, steps=6), "-o", folder / "x.h5") == 0
     return folder / "x.h5"
 
 
@@ -88,7 +88,7 @@ def test_it_goes_on_or_says_in_one_line_why_not(stopped, tmp_path, capsys, edits
             change(file, *one)
     capsys.readouterr()
     with limits():
-        status = main(["run", "--resume", str(path)])
+        status = status_of("run", "--resume", path)
     told = [line for line in capsys.readouterr().err.splitlines() if "msmpetsc: error" in line]
     assert status in (0, 2, 3) and (status == 0) == (not told)
     assert all(line.isprintable() for line in told) and not any(
@@ -147,7 +147,7 @@ def test_a_damaged_part_is_named_in_one_line(stopped, tmp_path, capsys, how, nam
     with h5py.File(path, "r+") as file:
         how(file, name)
     before = path.read_bytes()
-    assert main(["run", "--resume", str(path)]) == 2
+    assert status_of("run", "--resume", path) == 2
     told = [line for line in capsys.readouterr().err.splitlines() if "msmpetsc: error" in line]
     assert len(told) == 1 and name.rpartition("/")[2] in told[0]
     assert path.read_bytes() == before

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import CELL, CLAMP, GRAVITY, block_scene, clamped_beam, play
+from block_scene import CELL, CLAMP, GRAVITY, block_scene, clamped_beam, plane_at, play
 from failing_steps import Failing
 
 from msmpetsc.errors import StepFailed
@@ -46,13 +46,7 @@ def test_a_swing_gains_nothing(tmp_path: Path, integrator: str):
 def test_a_led_and_dragged_body_gains_nothing(tmp_path: Path, integrator: str, share: float):
     """Work of anchors and obstacles counts: a rough plate is pressed in and pulled away."""
     time = TIME | {"integrator": integrator, "step": STEP / 4 if integrator == "bdf2" else STEP}
-    floor = {
-        "shape": "plane",
-        "point": [0, 0, 0],
-        "normal": [0, 0, 1],
-        "response": "penalty",
-        "friction": 0.8,
-    }
+    floor = plane_at(response="penalty", friction=0.8)
     floor |= {"path": [{"time": 0.05, "by": [0, 0, 0.01]}, {"time": 0.1, "by": [0.4, 0, 0.01]}]}
     lead = {"region": CLAMP["region"], "path": [{"time": 0.1, "by": [0.1, 0, 0]}]}
     for more in ({"obstacle": [floor], "gravity": GRAVITY}, {"anchor": [lead]}):

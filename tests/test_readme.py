@@ -23,6 +23,7 @@ import trimesh
 from conftest import ROOT, python, run
 from formulas import Formulas
 from hooks import page_of_script
+from obj_files import write_obj
 from reference_tables import MARKER, TABLES, with_tables
 
 from msmpetsc.app.request import OPTIONS, flag_of
@@ -189,10 +190,7 @@ def write_own_scene(folder: Path) -> None:
     (folder / "scene.toml").write_text(blocks(START / "own-mesh.md", "toml")[0])
     box = trimesh.creation.box(bounds=[[0, 0, 0], [1, 0.5, 0.5]])
     at_end = (box.vertices[box.faces, 0] == 1).all(axis=1)
-    lines = [f"v {x} {y} {z}" for x, y, z in box.vertices]
-    for group, faces in (("side", box.faces[~at_end]), ("tip", box.faces[at_end])):
-        lines += [f"g {group}", *(f"f {a} {b} {c}" for a, b, c in faces + 1)]
-    (folder / "body.obj").write_text("\n".join([*lines, ""]))
+    write_obj(folder / "body.obj", box, {"side": ~at_end, "tip": at_end})
 
 
 @pytest.fixture(scope="module")

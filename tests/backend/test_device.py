@@ -4,14 +4,14 @@ from pathlib import Path
 from unittest.mock import patch
 
 import pytest
-from block_scene import block_scene, play
+from block_scene import GRAVITY, block_scene, play
 from mpi4py import MPI
 from one_process import assert_one_line
 
 from msmpetsc.errors import InputError
 from msmpetsc.solve.petsc import device
 
-FALL = {"time": {"step": 0.01, "duration": 0.02}, "gravity": {"acceleration": [0, 0, -9.81]}}
+FALL = {"time": {"step": 0.01, "duration": 0.02}, "gravity": GRAVITY}
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ import numba
 import numpy as np
 import pretend_gpu
 import pytest
-from block_scene import CELL, GRAVITY, block_scene, play
+from block_scene import CELL, GRAVITY, block_scene, box_at, plane_at, play, solid_of
 from conftest import WORKERS, python, run
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -44,27 +44,18 @@ FALL = {
     "gravity": GRAVITY,
     "start": {"velocity": [0.1, 0, -1.0]},
 }
-FLOOR = {"shape": "plane", "point": [0, 0, -0.01], "normal": [0, 0, 1]}
-PLATE = {
-    "shape": "box", "box": [[-1, -1, 0.25], [2, 2, 0.5]], "response": "penalty", "friction": 0.3,
-    "path": [{"time": 4 * T, "by": [0.01, 0, -0.05]}],
-}  # fmt: skip
+FLOOR = plane_at(-0.01)
+PRESSES = [{"time": 4 * T, "by": [0.01, 0, -0.05]}]
+PLATE = box_at([[-1, -1, 0.25], [2, 2, 0.5]], response="penalty", friction=0.3, path=PRESSES)
 # thinner than the way of a step
-THIN = {"shape": "box", "box": [[-1, -1, -0.0041], [2, 2, -0.004]]}
+THIN = box_at([[-1, -1, -0.0041], [2, 2, -0.004]])
 HELD = {"pin": [{"region": {"box": [[0, 0, 0], [0.1, 1, 1]], "relative": True}}]}
 LED = {
     "anchor": [{"region": {"box": [[0.9, 0, 0], [1, 1, 1]], "relative": True}, "stop": 4 * T,
                 "path": [{"time": 4 * T, "by": [0.05, 0, 0]}]}]
 }  # fmt: skip
 SOFT = {"material": {"young_modulus": 2e4, "density": 1000.0, "law": "linear"}}
-SOLID = {
-    "material": {
-        "young_modulus": 2e4,
-        "density": 1000.0,
-        "law": "neo-hookean",
-        "poisson_ratio": 0.4,
-    }
-}
+SOLID = {"material": solid_of(2e4, 0.4)}
 VISCOUS = {"material": {**SOLID["material"], "retardation_time": 0.01}}
 ROLLS = {
     "pin": [*HELD["pin"], {"region": {"half_space": {"point": [0, 0.01, 0], "normal": [0, -1, 0]}},

@@ -102,9 +102,10 @@ class Recorder:
         self.run[file_of(report.nodeid)] += report.duration
 
     def pytest_sessionfinish(self) -> None:
-        """Write the seconds of all files, of files that were not run as they were."""
+        """Write the seconds of all files there are, of files that were not run as they were."""
         seconds = self.seconds | {file: round(took, 1) for file, took in self.run.items()}
-        lines = json.dumps(dict(sorted(seconds.items())), indent=0)
+        there = {file: seconds[file] for file in sorted(seconds) if Path(file).is_file()}
+        lines = json.dumps(there, indent=0)
         DURATIONS.write_text(f"{lines}\n")
 
 

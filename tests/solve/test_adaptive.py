@@ -110,8 +110,8 @@ def test_the_estimate_of_a_bar_two_cells_across_that_is_let_go(tmp_path: Path, s
         "output": {"surface": False, "every": 1},
     }
     sides, time = np.array([1.0, 0.25, 0.25]), {"duration": 0.2, "integrator": "bdf2"}
-    fine = time | {"step": STEP / 64}
-    exact = play(block_scene(tmp_path, sides, **tables, time=fine), "output.every=64")[1]
+    fine = time | {"step": STEP / 32}
+    exact = play(block_scene(tmp_path, sides, **tables, time=fine), "output.every=32")[1]
     chosen = time | {"step": STEP, "error": 0.05}
     model, frames = play(block_scene(tmp_path, sides, **tables, time=chosen))
     ratio = frames[-1].time_error / error_of(model, frames, exact)

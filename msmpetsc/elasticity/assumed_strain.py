@@ -52,11 +52,22 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Floats
 from msmpetsc.backend.kernel import njit
-from msmpetsc.elasticity.cell_strain import Eight, Modes, Nine, Seven, Strains
-from msmpetsc.elasticity.springs import Four, Vector, dot
+from msmpetsc.elasticity.cell_strain import Eight, Four, Modes, Seven, Strains
+from msmpetsc.elasticity.vectors import (
+    Three,
+    Vector,
+    added,
+    combined,
+    dot,
+    each,
+    inner,
+    products,
+    scaled,
+    times,
+    total,
+    transposed,
+)
 
-# three vectors: of the axes x, y and z, or of the modes XY, XZ and YZ
-Three: TypeAlias = tuple[Vector, Vector, Vector]
 # three vectors for each axis
 NineVectors: TypeAlias = tuple[Three, Three, Three]
 
@@ -83,22 +94,6 @@ HARDENING = _single(2.0)
 LEAST = _single(1e-30)
 
 
-# ---- three vectors
-
-
-@njit(inline="always")
-def columns(f: Nine) -> Three:
-    """Return the columns of a matrix (9,) by rows."""
-    return (f[0], f[3], f[6]), (f[1], f[4], f[7]), (f[2], f[5], f[8])
-
-
-@njit(inline="always")
-def by_rows(f: Three) -> Nine:
-    """Return a matrix (9,) by rows from its columns."""
-    x, y, z = f
-    return x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2]
-
-
 @njit(inline="always")
 def modes_of(e: Strains) -> Three:
     """Return the modes XY, XZ and YZ of a strain."""
@@ -111,65 +106,6 @@ def slopes_of(e: Strains) -> Three:
     """Return the mean slopes along each axis of a strain, 4 h times the columns of F."""
     x, y, z = e
     return (x[0], y[0], z[0]), (x[1], y[1], z[1]), (x[2], y[2], z[2])
-
-
-@njit(inline="always")
-def _scaled(a: float, x: Vector) -> Vector:
-    return a * x[0], a * x[1], a * x[2]
-
-
-@njit(inline="always")
-def _added(x: Vector, y: Vector) -> Vector:
-    return x[0] + y[0], x[1] + y[1], x[2] + y[2]
-
-
-@njit(inline="always")
-def _sum(x: Three, y: Three) -> Three:
-    return _added(x[0], y[0]), _added(x[1], y[1]), _added(x[2], y[2])
-
-
-@njit(inline="always")
-def _times(a: float, x: Three) -> Three:
-    return _scaled(a, x[0]), _scaled(a, x[1]), _scaled(a, x[2])
-
-
-@njit(inline="always")
-def combined(t: Vector, x: Three) -> Vector:
-    """Return the sum of t_i x_i."""
-    a, b, c = t
-    f, g, h = x
-    return (
-        a * f[0] + b * g[0] + c * h[0],
-        a * f[1] + b * g[1] + c * h[1],
-        a * f[2] + b * g[2] + c * h[2],
-    )
-
-
-@njit(inline="always")
-def _each(t: Three, x: Three) -> Three:
-    """Return the sums of t_i,j x_j for each i."""
-    return combined(t[0], x), combined(t[1], x), combined(t[2], x)
-
-
-@njit(inline="always")
-def _transposed(t: Three) -> Three:
-    x, y, z = t
-    return (x[0], y[0], z[0]), (x[1], y[1], z[1]), (x[2], y[2], z[2])
-
-
-@njit(inline="always")
-def _inner(x: Three, y: Three) -> float:
-    return dot(x[0], y[0]) + dot(x[1], y[1]) + dot(x[2], y[2])
-
-
-@njit(inline="always")
-def _products(x: Three, y: Three) -> Three:
-    """Return x_i . y_j for each i and j."""
-    return (
-        (dot(x[0], y[0]), dot(x[0], y[1]), dot(x[0], y[2])),
-        (dot(x[1], y[0]), dot(x[1], y[1]), dot(x[1], y[2])),
-        (dot(x[2], y[0]), dot(x[2], y[1]), dot(x[2], y[2])),
-    )
 
 
 # ---- directions
@@ -189,7 +125,7 @@ def factors(f: Three) -> Vector:
 @njit(inline="always")
 def directions(f: Three, c: Vector) -> Three:
     """Return the directions n (Eq. 1) of the columns f, from their factors c."""
-    return _scaled(c[0], f[0]), _scaled(c[1], f[1]), _scaled(c[2], f[2])
+    return scaled(c[0], f[0]), scaled(c[1], f[1]), scaled(c[2], f[2])
 
 
 @njit(inline="always")
@@ -304,23 +240,23 @@ def _with_full(c: Eight, e: Strains, forces: Three) -> Modes:
 
 
 @njit(inline="always")
-def rest_gradient(c: Eight, f: Three, e: Strains, inverse_h4: float) -> tuple[Nine, Modes]:
-    """Return the gradient of W (Eq. 5) by 4 h times the slopes (9,), and by the modes (3 x 4).
+def rest_gradient(c: Eight, f: Three, e: Strains, inverse_h4: float) -> tuple[Three, Modes]:
+    """Return the gradient of W (Eq. 5) by 4 h times the slopes, and by the modes (3 x 4).
 
     f : columns of F
     e : strains of positions; ``inverse_h4`` is 1 / (4 h)
     """
     p, factor = modes_of(e), factors(f)
     n = directions(f, factor)
-    t = tensions(c, _products(n, p))
-    slopes = _times(inverse_h4, turned(f, factor, _each(t, p)))
-    hardening = _hardening(c) * inverse_h4 * inverse_h4 * _inner(p, p)
-    forces = _sum(_each(_transposed(t), n), _times(hardening, p))
-    return by_rows(slopes), _with_full(c, e, forces)
+    t = tensions(c, products(n, p))
+    slopes = times(inverse_h4, turned(f, factor, each(t, p)))
+    hardening = _hardening(c) * inverse_h4 * inverse_h4 * inner(p, p)
+    forces = total(each(transposed(t), n), times(hardening, p))
+    return slopes, _with_full(c, e, forces)
 
 
 @njit(inline="always")
-def rest_product(c: Eight, f: Three, p: Three, e: Strains) -> tuple[Nine, Modes]:
+def rest_product(c: Eight, f: Three, p: Three, e: Strains) -> tuple[Three, Modes]:
     """Return the product of the Hessian of W with a displacement, as ``rest_gradient`` does.
 
     f : columns of F
@@ -329,25 +265,25 @@ def rest_product(c: Eight, f: Three, p: Three, e: Strains) -> tuple[Nine, Modes]
     """
     h, g, factor = modes_of(e), slopes_of(e), factors(f)
     n, m = directions(f, factor), turned(f, factor, g)
-    s = tensions(c, _products(n, p))
-    t = tensions(c, _sum(_products(n, h), _products(m, p)))
-    slopes = _sum(
-        turned(f, factor, _sum(_each(t, p), _each(s, h))),
-        change_of_turned(f, factor, _each(s, p), g),
+    s = tensions(c, products(n, p))
+    t = tensions(c, total(products(n, h), products(m, p)))
+    slopes = total(
+        turned(f, factor, total(each(t, p), each(s, h))),
+        change_of_turned(f, factor, each(s, p), g),
     )
     hardening = _hardening(c)
-    along = hardening * _inner(p, h)
-    hard = _sum(_times(hardening * _inner(p, p), h), _times(along + along, p))
-    forces = _sum(_sum(_each(_transposed(t), n), _each(_transposed(s), m)), hard)
-    return by_rows(slopes), _with_full(c, e, forces)
+    along = hardening * inner(p, h)
+    hard = total(times(hardening * inner(p, p), h), times(along + along, p))
+    forces = total(total(each(transposed(t), n), each(transposed(s), m)), hard)
+    return slopes, _with_full(c, e, forces)
 
 
 @njit(inline="always")
 def projected_modes(c: Eight, f: Three, e: Strains) -> Modes:
     """Return the product of the projected Hessian of W: its directions do not change."""
     n = directions(f, factors(f))
-    t = tensions(c, _products(n, modes_of(e)))
-    return _with_full(c, e, _each(_transposed(t), n))
+    t = tensions(c, products(n, modes_of(e)))
+    return _with_full(c, e, each(transposed(t), n))
 
 
 @njit(inline="always")
@@ -356,10 +292,10 @@ def _change_of_direction(f: Vector, g: Vector) -> Vector:
 
     n' - n = c' g + (c' - c) f,    c' - c = -c c' / (1 + D) g . (f + f').
     """
-    after = _added(f, g)
+    after = added(f, g)
     c = _factor(after)
-    along = -_factor(f) * c / RANGE * dot(g, _added(f, after))
-    return _added(_scaled(c, g), _scaled(along, f))
+    along = -_factor(f) * c / RANGE * dot(g, added(f, after))
+    return added(scaled(c, g), scaled(along, f))
 
 
 @njit(inline="always")
@@ -375,13 +311,13 @@ def rest_change(c: Eight, f: Three, g: Three, e: Strains, d: Strains, inverse_h4
         _change_of_direction(f[1], g[1]),
         _change_of_direction(f[2], g[2]),
     )
-    changes = _sum(_products(m, _sum(p, moved)), _products(n, moved))
-    t = tensions(c, _sum(_products(n, p), _times(0.5, changes)))
-    change = _inner(changes, t)
+    changes = total(products(m, total(p, moved)), products(n, moved))
+    t = tensions(c, total(products(n, p), times(0.5, changes)))
+    change = inner(changes, t)
     # q'^2 - q^2 = (q' - q) (q' + q), with q = p . p
-    growth = _inner(moved, _sum(p, _sum(p, moved)))
+    growth = inner(moved, total(p, total(p, moved)))
     hardening = 0.25 * _hardening(c) * inverse_h4 * inverse_h4
-    change += hardening * growth * (2.0 * _inner(p, p) + growth)
+    change += hardening * growth * (2.0 * inner(p, p) + growth)
     for i in range(3):
         forces, own, before = full_forces(c, d[i]), d[i], e[i]
         change += forces[0] * (before[3] + 0.5 * own[3]) + forces[1] * (before[4] + 0.5 * own[4])
@@ -409,9 +345,9 @@ def corner_tensions(c: Eight, f: Three, g: Seven) -> NineVectors:
         tensions(c, (zero, zero, h)),
     )
     return (
-        _each(_transposed((x[0], y[0], z[0])), n),
-        _each(_transposed((x[1], y[1], z[1])), n),
-        _each(_transposed((x[2], y[2], z[2])), n),
+        each(transposed((x[0], y[0], z[0])), n),
+        each(transposed((x[1], y[1], z[1])), n),
+        each(transposed((x[2], y[2], z[2])), n),
     )
 
 
@@ -432,10 +368,10 @@ def rest_concavity(
 
     So the form is at least A |G|^2 - 2 X |G| |h| + B |h|^2, which is semidefinite if A B >= X^2.
     """
-    p, factor = _times(inverse_h4, modes_of(e)), factors(f)
+    p, factor = times(inverse_h4, modes_of(e)), factors(f)
     n = directions(f, factor)
-    t = tensions(c, _products(n, p))
-    r = _each(t, p)
+    t = tensions(c, products(n, p))
+    r = each(t, p)
     largest, turning = max(factor[0], max(factor[1], factor[2])), 0.0
     for i in range(3):
         square = dot(f[i], f[i])
@@ -449,9 +385,9 @@ def rest_concavity(
     xy, xz, yz = abs(dot(n[0], n[1])), abs(dot(n[0], n[2])), abs(dot(n[1], n[2]))
     x, y, z = dot(n[0], n[0]) - xy - xz, dot(n[1], n[1]) - xy - yz, dot(n[2], n[2]) - xz - yz
     frame = max(min(x, min(y, z)), 0.0)
-    of_slopes = left - turning - greatest * largest * largest * _inner(p, p)
+    of_slopes = left - turning - greatest * largest * largest * inner(p, p)
     of_modes = 0.5 * least * frame
-    mixed = largest * math.sqrt(_inner(t, t))
+    mixed = largest * math.sqrt(inner(t, t))
     a = max(mixed - of_slopes, 0.0)
     b = max(mixed * mixed / max(of_slopes + a, float(LEAST)) - of_modes, 0.0)
     return a, b

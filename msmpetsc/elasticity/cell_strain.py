@@ -8,15 +8,15 @@ from typing import TypeAlias
 
 from msmpetsc.backend.arrays import Floats
 from msmpetsc.backend.kernel import njit
-from msmpetsc.elasticity.springs import Four, Vector
+from msmpetsc.elasticity.vectors import Three, Vector
 
 # cells of a block [-]; eight doubles fill the widest vector register
 LANES = 8
 
+Four: TypeAlias = tuple[float, float, float, float]
 Six: TypeAlias = tuple[float, float, float, float, float, float]
 Seven: TypeAlias = tuple[float, float, float, float, float, float, float]
 Eight: TypeAlias = tuple[float, float, float, float, float, float, float, float]
-Nine: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
 # strains of the components x, y and z
 Strains: TypeAlias = tuple[Seven, Seven, Seven]
 # derivatives by the four modes, for the components x, y and z
@@ -66,15 +66,16 @@ def corner_strain(a: int, form: Six) -> Seven:
 
 
 @njit(inline="always")
-def write_forces(store: Floats, at: int, form: Six, slopes: Nine, modes: Modes) -> None:
+def write_forces(store: Floats, at: int, form: Six, slopes: Three, modes: Modes) -> None:
     """Write the gradient at a cell's corners, 24 numbers, into ``store`` from index ``at``.
 
-    slopes : (9,) derivative of E with respect to 4 h times the mean slopes
+    slopes : derivative of E with respect to 4 h times the columns of F
     modes  : (3 x 4) derivative of E with respect to the modes of each component
     """
-    _write_component(store, at, form, (slopes[0], slopes[1], slopes[2]), modes[0])
-    _write_component(store, at + 8, form, (slopes[3], slopes[4], slopes[5]), modes[1])
-    _write_component(store, at + 16, form, (slopes[6], slopes[7], slopes[8]), modes[2])
+    x, y, z = slopes
+    _write_component(store, at, form, (x[0], y[0], z[0]), modes[0])
+    _write_component(store, at + 8, form, (x[1], y[1], z[1]), modes[1])
+    _write_component(store, at + 16, form, (x[2], y[2], z[2]), modes[2])
 
 
 @njit(inline="always")

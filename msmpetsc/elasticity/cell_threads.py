@@ -13,7 +13,7 @@ from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.backend.kernel import kernel, njit
 from msmpetsc.elasticity.assumed_strain import rest_constants
 from msmpetsc.elasticity.cell_blocks import PROJECTED, ROWS, CellBlocks, CellRows, one_by_one
-from msmpetsc.elasticity.cell_strain import LANES, Nine, Strains, form_of, strain, write_forces
+from msmpetsc.elasticity.cell_strain import LANES, Strains, form_of, strain, write_forces
 from msmpetsc.elasticity.neo_hookean import (
     cell_gradient,
     cell_product,
@@ -27,6 +27,7 @@ from msmpetsc.elasticity.neo_hookean import (
     write_state,
 )
 from msmpetsc.elasticity.springs import Displacement
+from msmpetsc.elasticity.vectors import Three
 
 
 @njit(inline="always")
@@ -56,8 +57,8 @@ def strains_at(q: Positions, cells: CellRows, i: int) -> Strains:
 
 
 @njit(inline="always")
-def gradient_at(q: Positions, cells: CellRows, i: int) -> Nine:
-    """Return F (9,) of cell i at positions q (l, 3) [m]."""
+def gradient_at(q: Positions, cells: CellRows, i: int) -> Three:
+    """Return F of cell i at positions q (l, 3) [m]."""
     return gradient_of(strains_at(q, cells, i), 1.0 / cells.h4)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
 from msmpetsc.backend.kernel import kernel, njit
 from msmpetsc.elasticity.cell_strain import Six, strain
-from msmpetsc.elasticity.springs import Vector, dot, vector
+from msmpetsc.elasticity.vectors import Vector, cross, dot, vector
 
 
 class Shapes(NamedTuple):
@@ -18,11 +18,6 @@ class Shapes(NamedTuple):
 
     cells: Indices
     forms: Rows
-
-
-@njit(inline="always")
-def cross(a: Vector, b: Vector) -> Vector:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @njit()

@@ -22,8 +22,6 @@ from msmpetsc.backend.kernel import kernel, njit
 from msmpetsc.elasticity import cell_lanes, cell_threads
 from msmpetsc.elasticity.assumed_strain import (
     ASSUMED,
-    columns,
-    combined,
     corner_tensions,
     directions,
     factors,
@@ -43,13 +41,12 @@ from msmpetsc.elasticity.cell_strain import LANES, corner_strain, form_of
 from msmpetsc.elasticity.cell_threads import constants_at, linearise, state_at, strains_at
 from msmpetsc.elasticity.neo_hookean import (
     VOLUMETRIC,
-    along_cofactors,
     concavity_bounds,
     corner_stiffness,
-    kept_cofactors,
     kept_gradient,
 )
-from msmpetsc.elasticity.springs import Vector, add_block
+from msmpetsc.elasticity.springs import add_block
+from msmpetsc.elasticity.vectors import Vector, cofactors, combined
 from msmpetsc.lattice.lattice import Lattice
 
 
@@ -96,16 +93,16 @@ def _add_concavity(
 def _add_diagonal(first: int, count: int, step: int, diagonal: Rows, cells: CellRows) -> None:
     for i in range(first, count, step):
         k, s = constants_at(cells, i), state_at(cells, i)
-        cofactors, curvature = kept_cofactors(cells.state, s), cells.state[s + 80]
-        f, rest = columns(kept_gradient(cells.state, s)), rest_constants(cells.constants, k)
-        n = directions(f, factors(f))
+        f, curvature = kept_gradient(cells.state, s), cells.state[s + 80]
+        rest = rest_constants(cells.constants, k)
+        n, normals = directions(f, factors(f)), cofactors(f)
         for a in range(8):
             g, block = corner_strain(a, form_of(cells.constants, k)), diagonal[_row_of(cells, i, a)]
             own = corner_stiffness(g, cells.constants, k)
             block[0] += own
             block[4] += own
             block[8] += own
-            add_block(block, 0.0, curvature, along_cofactors(cofactors, g))
+            add_block(block, 0.0, curvature, combined((g[0], g[1], g[2]), normals))
             t = corner_tensions(rest, f, g)
             for axis in range(3):
                 _add_along(block, n[axis], combined((g[3], g[4], g[5]), t[axis]))

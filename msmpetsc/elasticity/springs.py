@@ -22,23 +22,17 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, like, on_host, to_host
 from msmpetsc.backend.kernel import kernel, njit
+from msmpetsc.elasticity.cell_strain import Four
+from msmpetsc.elasticity.vectors import Vector, dot, vector
 from msmpetsc.lattice.lattice import Lattice
 
 # product(v, result) adds (Hessian) v [N] to ``result``
 Product = Callable[[Array, Array], None]
-Vector = tuple[float, float, float]
-Four = tuple[float, float, float, float]
 
 # index of each entry of a symmetric 3 x 3 block in its upper triangle [-]
 SYMMETRIC = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
 # smallest length to divide by [m]; a spring of zero length then has no force
 TINY = 1e-300
-
-
-@njit(inline="always")
-def dot(a: Vector, b: Vector) -> float:
-    """Return a . b."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @njit()
@@ -125,12 +119,6 @@ class Displacement(NamedTuple):
     def to(cls, end: Positions, base: Positions) -> "Displacement":
         """Return the displacement from ``base`` to ``end``."""
         return cls(base, end - base)
-
-
-@njit(inline="always")
-def vector(q: Positions, a: int, b: int) -> Vector:
-    """Return the vector q_b - q_a from node a to node b."""
-    return q[b, 0] - q[a, 0], q[b, 1] - q[a, 1], q[b, 2] - q[a, 2]
 
 
 @kernel

@@ -12,8 +12,7 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions
 from msmpetsc.backend.kernel import njit
-from msmpetsc.elasticity.cell_volume import cross
-from msmpetsc.elasticity.springs import Vector, dot, vector
+from msmpetsc.elasticity.vectors import Vector, cross, dot, vector
 
 # Kinds of places.
 VERTICES, EDGE_VERTEX, FACE_VERTEX, EDGES = range(4)

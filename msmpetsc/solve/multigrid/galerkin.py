@@ -19,8 +19,6 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, like, on_host, to_host
 from msmpetsc.backend.kernel import kernel, njit
 from msmpetsc.elasticity.assumed_strain import (
-    Three,
-    columns,
     corner_tensions,
     directions,
     factors,
@@ -31,9 +29,10 @@ from msmpetsc.elasticity.cell_blocks import CellRows, one_by_one
 from msmpetsc.elasticity.cell_strain import form_of, strain
 from msmpetsc.elasticity.cell_threads import constants_at, state_at
 from msmpetsc.elasticity.energy import Elasticity
-from msmpetsc.elasticity.neo_hookean import along_cofactors, kept_cofactors, kept_gradient
+from msmpetsc.elasticity.neo_hookean import kept_gradient
 from msmpetsc.elasticity.solid import CellHessians
 from msmpetsc.elasticity.springs import SYMMETRIC, Springs, spring_block
+from msmpetsc.elasticity.vectors import Three, cofactors, combined, cross, scaled
 from msmpetsc.geometry.grid import CORNERS
 from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
 from msmpetsc.solve.linear.unknowns import Unknowns, refuse_nonzeros
@@ -362,7 +361,7 @@ def add_solid(
         for at in range(by_cell.start[i], by_cell.start[i + 1]):
             cell = by_cell.order[at]
             k, s = constants_at(cells, cell), state_at(cells, cell)
-            m, f = cells.constants[k + 104], columns(kept_gradient(cells.state, s))
+            m, f = cells.constants[k + 104], kept_gradient(cells.state, s)
             n = directions(f, factors(f))
             _write_coarse(e, weights, by_cell.code[at], cells, k, s)
             pair = -1
@@ -385,8 +384,8 @@ def _write_coarse(rows: Rows, weights: Rows, code: Array, cells: CellRows, k: in
     A row has the strain of a unit displacement (7), ``full_forces`` (4), cof F g (3) and
     ``corner_tensions`` (27).
     """
-    f, rest = columns(kept_gradient(cells.state, s)), rest_constants(cells.constants, k)
-    n = kept_cofactors(cells.state, s)
+    f, rest = kept_gradient(cells.state, s), rest_constants(cells.constants, k)
+    n = cofactors(f)
     for a in range(8):
         u = (
             weights[code[0], a], weights[code[1], a], weights[code[2], a], weights[code[3], a],
@@ -395,7 +394,7 @@ def _write_coarse(rows: Rows, weights: Rows, code: Array, cells: CellRows, k: in
         e, row = strain(u, form_of(cells.constants, k)), rows[a]
         row[0], row[1], row[2], row[3], row[4], row[5], row[6] = e
         row[7], row[8], row[9], row[10] = full_forces(rest, e)
-        row[11], row[12], row[13] = along_cofactors(n, e)
+        row[11], row[12], row[13] = combined((e[0], e[1], e[2]), n)
         t = corner_tensions(rest, f, e)
         for axis in range(3):
             for mode in range(3):
@@ -424,13 +423,12 @@ def _add_block(block: Floats, own: float, state: Floats, s: int, g: Floats, h: F
     m and n are cof F g and cof F h. The last term is the bilinear form v . (F x (u (x) h)) g.
     """
     f, slope, curvature = kept_gradient(state, s), state[s + 72], state[s + 80]
-    x, y, z = h[1] * g[2] - h[2] * g[1], h[2] * g[0] - h[0] * g[2], h[0] * g[1] - h[1] * g[0]
+    t = cross((h[0], h[1], h[2]), (g[0], g[1], g[2]))
     for r in range(3):
         block[4 * r] += own
         for c in range(3):
             block[3 * r + c] += curvature * g[11 + r] * h[11 + c]
-    a, b = slope * (f[0] * x + f[1] * y + f[2] * z), slope * (f[3] * x + f[4] * y + f[5] * z)
-    c = slope * (f[6] * x + f[7] * y + f[8] * z)
+    a, b, c = scaled(slope, combined(t, f))
     block[7] += a
     block[5] -= a
     block[2] += b

@@ -301,8 +301,8 @@ class Multigrid:
         """Yield our defaults for PETSc's options of the product P^T H P."""
         given = PETSc.Options().getAll()
         if "matptap_via" not in given:
-            # PETSc's default sums messages in the order of arrival, which varies. On one
-            # rank rap takes a third of its time.
+            # PETSc's default sums messages in the order of arrival, which varies.
+            # On one rank rap takes a third of its time.
             yield "matptap_via", "allatonce" if matrix.comm.size > 1 else "rap"
         # The product of PETSc 3.26 on an H100 is wrong: it is 0.
         if self.unknowns.memory is device.CUDA and "matptap_backend_cpu" not in given:

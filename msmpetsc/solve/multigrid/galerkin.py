@@ -424,10 +424,10 @@ def _add_block(block: Floats, own: float, state: Floats, s: int, g: Floats, h: F
     """
     f, slope, curvature = kept_gradient(state, s), state[s + 72], state[s + 80]
     t = cross((h[0], h[1], h[2]), (g[0], g[1], g[2]))
-    for r in range(3):
-        block[4 * r] += own
-        for c in range(3):
-            block[3 * r + c] += curvature * g[11 + r] * h[11 + c]
+    for row in range(3):
+        block[4 * row] += own
+        for column in range(3):
+            block[3 * row + column] += curvature * g[11 + row] * h[11 + column]
     a, b, c = scaled(slope, combined(t, f))
     block[7] += a
     block[5] -= a

@@ -135,6 +135,10 @@ class ErrorControl:
         lowest = now.compression.least_curvature
         return replace(now, error=bound / lowest if lowest > 0 else np.inf)
 
+    def at_rounding(self, iterate: Iterate, now: Outcome) -> Outcome:
+        """Return the outcome at an iterate below which g has no digits: F may be rounding."""
+        return replace(now, at_rounding=self.rounding.explains(iterate, True))
+
     def is_near(self, now: Outcome) -> bool:
         """Return whether the error may be below the goal, by the last ratio of bound to error."""
         return now.at_rounding or now.bound <= self.ratio * now.goal

@@ -126,7 +126,8 @@ class Newton(StepMethod):
             share = self._limit(now)
             lower = self._search(now, outcome.is_flat)
             if lower is None and projected:
-                reason = REASON.DIVERGED_LINE_SEARCH
+                outcome = self.control.at_rounding(now, outcome)
+                reason = self.reason_to_end(its, outcome) or REASON.DIVERGED_LINE_SEARCH
                 break
             if lower is None:
                 projected = PROJECTED

@@ -28,7 +28,8 @@ from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like
 from msmpetsc.comm import log
 from msmpetsc.constraints.anchors import Anchor
 from msmpetsc.errors import InputError
-from msmpetsc.lattice.lattice import Lattice
+from msmpetsc.geometry.partition import places_of
+from msmpetsc.lattice.lattice import Lattice, MadeSprings
 from msmpetsc.lattice.region import Finder
 from msmpetsc.scene.reading import Scene
 
@@ -158,7 +159,30 @@ def _with_cut_cells(
     factor[cut] = (np.bincount(cell) / np.maximum(np.bincount(cell, sigma_theta), LEAST**2))[cut]
     solid = lattice.solid
     solid = solid._replace(shear=factor * solid.shear, lame=factor * solid.lame)
-    return replace(lattice, solid=solid)
+    made = lattice.make_springs
+
+    def make_springs() -> MadeSprings:
+        # L must bound the stiffer cells, too
+        assert made is not None
+        springs = made()
+        stiffer = _greatest(corners[cut], factor[cut], springs.ends)
+        return springs._replace(stiffness=stiffer * springs.stiffness)
+
+    return replace(lattice, solid=solid, make_springs=make_springs)
+
+
+def _greatest(corners: Indices, factor: Floats, ends: Indices) -> Floats:
+    """Return the greatest factor (s,) of the cells that contain both ends (s, 2); 1 without any.
+
+    corners : corner nodes (c, 8) of cells with a factor (c,) of at least 1
+    """
+    count = int(max(corners.max(initial=0), ends.max(initial=0))) + 1
+    pairs = count * corners.astype(np.int64)[:, :, None] + corners[:, None, :]
+    keys, pair = np.unique(pairs, return_inverse=True)
+    most = np.ones(len(keys) + 1)
+    np.maximum.at(most, pair.ravel(), np.repeat(factor, 64))
+    # the last entry stands for pairs of other cells
+    return most[places_of(keys, count * ends[:, 0].astype(np.int64) + ends[:, 1])]
 
 
 def _free_fraction(within: Within, start: Positions, end: Positions) -> Floats:

@@ -18,7 +18,7 @@ reactions + loads + pushes = sum of m a.
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import partial, reduce
 from itertools import chain
 
 import numpy as np
@@ -159,30 +159,31 @@ def _with_cut_cells(
     factor[cut] = (np.bincount(cell) / np.maximum(np.bincount(cell, sigma_theta), LEAST**2))[cut]
     solid = lattice.solid
     solid = solid._replace(shear=factor * solid.shear, lame=factor * solid.lame)
-    made = lattice.make_springs
-
-    def make_springs() -> MadeSprings:
-        # L must bound the stiffer cells, too
-        assert made is not None
-        springs = made()
-        stiffer = _greatest(corners[cut], factor[cut], springs.ends)
-        return springs._replace(stiffness=stiffer * springs.stiffness)
-
-    return replace(lattice, solid=solid, make_springs=make_springs)
+    assert lattice.make_springs is not None
+    stiffer = partial(
+        _stiffer_springs, lattice.make_springs, len(lattice.nodes), corners[cut], factor[cut]
+    )
+    return replace(lattice, solid=solid, make_springs=stiffer)
 
 
-def _greatest(corners: Indices, factor: Floats, ends: Indices) -> Floats:
-    """Return the greatest factor (s,) of the cells that contain both ends (s, 2); 1 without any.
+def _stiffer_springs(
+    make_springs: Callable[[], MadeSprings], count: int, corners: Indices, factor: Floats
+) -> MadeSprings:
+    """Return springs whose L bounds cells that are stiffer by a factor, too (collective).
 
+    A spring takes the greatest factor of the cells that contain both its ends.
+
+    count   : number of local nodes
     corners : corner nodes (c, 8) of cells with a factor (c,) of at least 1
     """
-    count = int(max(corners.max(initial=0), ends.max(initial=0))) + 1
+    springs = make_springs()
     pairs = count * corners.astype(np.int64)[:, :, None] + corners[:, None, :]
     keys, pair = np.unique(pairs, return_inverse=True)
     most = np.ones(len(keys) + 1)
     np.maximum.at(most, pair.ravel(), np.repeat(factor, 64))
     # the last entry stands for pairs of other cells
-    return most[places_of(keys, count * ends[:, 0].astype(np.int64) + ends[:, 1])]
+    ends = count * springs.ends[:, 0].astype(np.int64) + springs.ends[:, 1]
+    return springs._replace(stiffness=most[places_of(keys, ends)] * springs.stiffness)
 
 
 def _free_fraction(within: Within, start: Positions, end: Positions) -> Floats:

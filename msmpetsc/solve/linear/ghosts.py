@@ -11,6 +11,15 @@ from msmpetsc.solve.petsc.device import memory_of
 from msmpetsc.solve.petsc.events import GHOSTS
 
 
+def local_numbers(columns: Indices, first: int, owned: int) -> tuple[Indices, Indices]:
+    """Return global numbers (k,) as local numbers, owned before ghosts, and the ghosts (g,)."""
+    is_own = (columns >= first) & (columns < first + owned)
+    ghosts, number = np.unique(columns[~is_own], return_inverse=True)
+    local = columns - first
+    local[~is_own] = owned + number
+    return local, ghosts
+
+
 class Ghosted:
     """Nodal values (l, 3), first owned nodes, then ghosts, shared with two PETSc vectors."""
 

@@ -18,6 +18,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.solve.linear.unknowns import Unknowns, refuse_nonzeros
 from msmpetsc.solve.petsc.device import Memory
 from msmpetsc.solve.petsc.events import CONTACT, HESSIAN, PRODUCT
+from msmpetsc.solve.petsc.library import petsc_csr
 
 
 class Block:
@@ -201,9 +202,7 @@ def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, prefix: str =
     if ("cusparse" in matrix.getType()) != on_gpu:
         computes = f"the run computes on the {'GPU' if on_gpu else 'CPU'}"
         raise InputError(f"-{prefix}mat_type {matrix.getType()}: {computes}")
-    matrix.setPreallocationCSR(
-        (csr.indptr.astype(PETSc.IntType), csr.indices.astype(PETSc.IntType), csr.data)
-    )
+    matrix.setPreallocationCSR(petsc_csr(csr))
     return matrix
 
 

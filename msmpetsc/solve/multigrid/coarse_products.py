@@ -7,6 +7,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Array, Indices, Mask, Rows
 from msmpetsc.backend.kernel import njit
+from msmpetsc.solve.linear.ghosts import Ghosted, local_numbers
 
 
 class BlockRows(NamedTuple):
@@ -45,6 +46,7 @@ class CoarseOperator:
     own      : upper triangle of the columns on this rank
     remote   : blocks whose columns are ghosts
     sums     : (n, 9) sums of the rows' blocks
+    nodes    : values of nodes in double precision, ghosts included; None on a single rank
     """
 
     def __init__(self, pattern: PETSc.Mat):
@@ -52,26 +54,18 @@ class CoarseOperator:
         begin, columns, _ = pattern.getValuesCSR()
         first, last = pattern.getOwnershipRange()
         self.begin = begin[:-1]
-        row = np.repeat(np.arange(last - first), np.diff(begin))
-        is_own = (columns >= first) & (columns < last)
-        ghosts, number = np.unique(columns[~is_own], return_inverse=True)
-        self.own = BlockRows.chosen(
-            is_own & (columns > first + row), last - first, row, columns - first
-        )
-        columns[~is_own] = number
-        self.remote = BlockRows.chosen(~is_own, last - first, row, columns)
-        self.sums = np.empty((last - first, 9), np.float32)
-        self.x, self.y = np.empty((2, last - first, 3), np.float32)
-        self.ghosts = PETSc.Vec().createSeq(3 * len(ghosts))
-        sizes = 3 * (last - first), 3 * pattern.getSize()[0]
+        owned = last - first
+        row = np.repeat(np.arange(owned), np.diff(begin))
+        local, ghosts = local_numbers(columns, first, owned)
+        self.own = BlockRows.chosen((local < owned) & (local > row), owned, row, local)
+        self.remote = BlockRows.chosen(local >= owned, owned, row, local - owned)
+        self.sums = np.empty((owned, 9), np.float32)
+        self.x, self.y = np.empty((2, owned, 3), np.float32)
+        self.nodes = Ghosted(self.comm, owned, ghosts, self.sums) if self.comm.size > 1 else None
+        sizes = 3 * owned, 3 * pattern.getSize()[0]
         self.operator = PETSc.Mat().createPython((sizes, sizes), self, comm=self.comm)
         self.operator.setBlockSize(3)
         self.operator.setUp()
-        whole = self.operator.createVecRight()
-        wanted = PETSc.IS().createBlock(3, ghosts.astype(PETSc.IntType))
-        self.scatter = PETSc.Scatter().create(whole, wanted, self.ghosts, None)
-        whole.destroy()
-        wanted.destroy()
 
     def update(self, blocks: Rows) -> None:
         """Take the blocks (k, 9) of this rank's rows."""
@@ -84,16 +78,17 @@ class CoarseOperator:
         """Write H x to y."""
         self.x[:] = x.array_r.reshape(-1, 3)
         multiply_upper(self.own, self.sums, self.x, self.y)
-        if self.comm.size > 1:
-            self.scatter.scatter(x, self.ghosts)
-            add_product(
-                self.remote, self.x, self.ghosts.array_r.reshape(-1, 3).astype(np.float32), self.y
-            )
+        if self.nodes:
+            owned = len(self.x)
+            self.nodes.values[:owned] = x.array_r.reshape(-1, 3)
+            self.nodes.update()
+            ghosts = self.nodes.values[owned:].astype(np.float32)
+            add_product(self.remote, self.x, ghosts, self.y)
         y.array_w[:] = self.y.ravel()
 
     def destroy(self, _: PETSc.Mat) -> None:
-        self.scatter.destroy()
-        self.ghosts.destroy()
+        if self.nodes:
+            self.nodes.destroy()
 
 
 @njit(fastmath={"reassoc", "contract", "nsz"})

@@ -16,6 +16,7 @@ from msmpetsc.backend.arrays import Array, Rows
 from msmpetsc.contact.surface.surface_contact import SurfaceHessian
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.interpolation import Interpolation
+from msmpetsc.solve.petsc.library import set_up_aij
 
 
 class ContactSmoother:
@@ -108,7 +109,8 @@ class CoarseContact:
         joined = kron(weights, eye_array(3), "csr").T @ (
             surface.points @ kron(whole, eye_array(3), "csr")
         )
-        contact = aij(self.t2 * csr_array(joined), coarsest)
+        contact = PETSc.Mat().create(coarsest.comm)
+        set_up_aij(contact, coarsest.getSizes(), coarsest.getType(), self.t2 * csr_array(joined), 3)
         self.destroy()
         self.coarsest = coarsest.copy()
         self.coarsest.axpy(1.0, contact, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
@@ -120,14 +122,3 @@ class CoarseContact:
         if self.coarsest:
             self.coarsest.destroy()
             self.coarsest = None
-
-
-def aij(rows: csr_array, like: PETSc.Mat) -> PETSc.Mat:
-    """Return a matrix with this rank's ``rows`` and the type and sizes of ``like`` (collective)."""
-    matrix = PETSc.Mat().create(like.comm)
-    matrix.setSizes(like.getSizes())
-    matrix.setBlockSize(3)
-    matrix.setType(like.getType())
-    begin, columns = (part.astype(PETSc.IntType) for part in (rows.indptr, rows.indices))
-    matrix.setPreallocationCSR((begin, columns, rows.data))
-    return matrix

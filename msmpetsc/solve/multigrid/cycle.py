@@ -38,7 +38,12 @@ from msmpetsc.solve.multigrid.galerkin import GalerkinSum
 from msmpetsc.solve.multigrid.grids import CoarseGrid, grids, interpolation, node_keys
 from msmpetsc.solve.multigrid.interpolation import Interpolation
 from msmpetsc.solve.petsc import device
-from msmpetsc.solve.petsc.library import replaced_option, set_chebyshev
+from msmpetsc.solve.petsc.library import (
+    petsc_csr,
+    replaced_option,
+    set_chebyshev,
+    set_up_aij,
+)
 
 # most nodes of the coarsest grid, which is factored; coarser grids lose thin limbs
 COARSEST = 1000
@@ -151,10 +156,7 @@ class Multigrid:
                 finer, coarser = len(keys), len(grid.table.keys)
                 sizes = (finer, levels[-1].grid.table.total), (coarser, grid.table.total)
                 scalar = PETSc.Mat().create(comm)
-                scalar.setSizes(sizes)
-                scalar.setType(unknowns.memory.mat_type)
-                index = (part.astype(PETSc.IntType) for part in (rows.indptr, rows.indices))
-                scalar.setPreallocationCSR((*index, rows.data))
+                set_up_aij(scalar, sizes, unknowns.memory.mat_type, rows)
                 self.owned.callback(scalar.destroy)
                 pattern = PETSc.Mat()
             levels.append(Level(grid, p, scalar, pattern, PETSc.Mat()))
@@ -317,7 +319,7 @@ class Multigrid:
         pc.setMGLevels(top + 1)
         for i, level in enumerate(self.levels):
             pc.setMGInterpolation(top - i, level.interpolation.operator)
-            pc.setMGRestriction(top - i, self._restriction(level.interpolation.operator))
+            pc.setMGRestriction(top - i, self._restriction(level.interpolation))
             ksp = pc.getMGSmoother(top - 1 - i) if i < top - 1 else pc.getMGCoarseSolve()
             ksp.setOperators(
                 self.coarse[i].operator if i < len(self.coarse) else level.matrix, level.matrix
@@ -328,18 +330,18 @@ class Multigrid:
         finest.getPC().setType(PETSc.PC.Type.PYTHON)
         finest.getPC().setPythonContext(DiagonalBlocks(self.fine))
 
-    def _restriction(self, interpolation: PETSc.Mat) -> PETSc.Mat:
+    def _restriction(self, interpolation: Interpolation) -> PETSc.Mat:
         """Return the restriction P^T as a matrix of its own.
 
         PETSc recognises the restriction by its shape, which fails for a square P. For a square
         matrix, PETSc 3.22 multiplies by the transpose and PETSc 3.18 by the matrix itself. PETSc
         3.22 fails for a MATTRANSPOSE as well.
         """
-        fine, coarse = interpolation.getSizes()
+        fine, coarse = interpolation.operator.getSizes()
         is_transposed = fine[1] == coarse[1] and PETSc.Sys.getVersion() >= TRANSPOSES_SQUARE
         shape = (fine, coarse) if is_transposed else (coarse, fine)
         restriction = PETSc.Mat().createPython(
-            shape, Restriction(interpolation), comm=interpolation.comm
+            shape, Restriction(interpolation), comm=self.unknowns.comm
         )
         restriction.setVecType(self.unknowns.memory.vec_type)
         restriction.setUp()
@@ -379,17 +381,13 @@ def set_blocks(
     """
     shape = len(begin) - 1, pattern.getSize()[1]
     rows = bsr_array((blocks.reshape(-1, 3, 3), columns, begin), 3 * np.array(shape)).tocsr()
-    csr = *(part.astype(PETSc.IntType) for part in (rows.indptr, rows.indices)), rows.data
     if matrix:
-        matrix.setValuesCSR(*csr)
+        matrix.setValuesCSR(*petsc_csr(rows))
         matrix.assemble()
         return
     matrix.create(pattern.comm)
-    matrix.setSizes(3 * np.array(pattern.getSizes()))
-    matrix.setBlockSize(3)
-    matrix.setType(pattern.getType())
+    set_up_aij(matrix, 3 * np.array(pattern.getSizes()), pattern.getType(), rows, 3)
     matrix.setOption(PETSc.Mat.Option.SPD, True)
-    matrix.setPreallocationCSR(csr)
     # PETSc gives the diagonal part of a parallel matrix no block size, but pbjacobi
     # inverts it.
     matrix.getDiagonalBlock().setBlockSize(3)
@@ -398,10 +396,10 @@ def set_blocks(
 class Restriction:
     """Apply P^T, also as its own transpose (a context of MATPYTHON)."""
 
-    def __init__(self, interpolation: PETSc.Mat):
+    def __init__(self, interpolation: Interpolation):
         self.interpolation = interpolation
 
-    def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        self.interpolation.multTranspose(x, y)
+    def mult(self, matrix: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        self.interpolation.multTranspose(matrix, x, y)
 
     multTranspose = mult

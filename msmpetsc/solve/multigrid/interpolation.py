@@ -9,7 +9,7 @@ from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Rows, like, to_host
 from msmpetsc.backend.kernel import kernel
-from msmpetsc.solve.linear.ghosts import Ghosted
+from msmpetsc.solve.linear.ghosts import Ghosted, local_numbers
 from msmpetsc.solve.multigrid.grids import CoarseGrid
 from msmpetsc.solve.petsc.device import memory_of
 
@@ -47,10 +47,7 @@ class Interpolation:
         """
         table, columns = grid.table, rows.indices
         self.own, self.first, self.is_first = len(table.keys), table.first, first
-        is_own = (columns >= table.first) & (columns < table.first + self.own)
-        self.ghosts, number = np.unique(columns[~is_own], return_inverse=True)
-        local = columns - table.first
-        local[~is_own] = self.own + number
+        local, self.ghosts = local_numbers(columns, table.first, self.own)
         size = rows.shape[0], self.own + len(self.ghosts)
         here = csr_array((rows.data, local, rows.indptr), size)
         self.parents, self.children = (

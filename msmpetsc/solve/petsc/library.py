@@ -10,6 +10,7 @@ from typing import Protocol
 
 import numpy as np
 from petsc4py import PETSc
+from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import Array, Floats, Indices
 from msmpetsc.errors import InputError, did_you_mean
@@ -68,6 +69,22 @@ def set_values_coo(matrix: PETSc.Mat, values: Floats) -> None:
             ctypes.c_void_p(matrix.handle), _address(values), ctypes.c_int(INSERT)
         )
     )
+
+
+def petsc_csr(rows: csr_array) -> tuple[Indices, Indices, Floats]:
+    """Return compressed rows with PETSc's type of indices: begin, columns and values."""
+    begin, columns = (part.astype(PETSc.IntType) for part in (rows.indptr, rows.indices))
+    return begin, columns, rows.data
+
+
+def set_up_aij(
+    matrix: PETSc.Mat, sizes: object, mat_type: str, rows: csr_array, side: int = 1
+) -> None:
+    """Give a new matrix its sizes, type, block size ``side`` and this rank's rows (collective)."""
+    matrix.setSizes(sizes)
+    matrix.setBlockSize(side)
+    matrix.setType(mat_type)
+    matrix.setPreallocationCSR(petsc_csr(rows))
 
 
 @contextmanager

@@ -353,7 +353,12 @@ def corner_tensions(c: Eight, f: Three, g: Seven) -> NineVectors:
 
 @njit(inline="always")
 def rest_concavity(
-    c: Eight, f: Three, e: Strains, inverse_h4: float, left: float
+    c: Eight,
+    f: Three,
+    e: Strains,
+    inverse_h4: float,
+    left: float,
+    spectrum: tuple[float, float],
 ) -> tuple[float, float]:
     """Return a, b >= 0: the Hessian of W, and ``left`` |G|^2, are at least -a |G|^2 - b |h|^2.
 
@@ -367,6 +372,8 @@ def rest_concavity(
       u = |f|^2 / (D + |f|^2).
 
     So the form is at least A |G|^2 - 2 X |G| |h| + B |h|^2, which is semidefinite if A B >= X^2.
+
+    spectrum : least and greatest eigenvalue of C in the constants
     """
     p, factor = times(inverse_h4, modes_of(e)), factors(f)
     n = directions(f, factor)
@@ -379,7 +386,7 @@ def rest_concavity(
         shape = max(2.0, 1.0 + (4.0 * u - 3.0) ** 2)
         change = _lag(factor[i]) * math.sqrt(square * dot(r[i], r[i]) * shape)
         turning = max(turning, change)
-    least, greatest = _least_and_greatest(c)
+    least, greatest = spectrum
     greatest *= max(2.0 + 2.0 * c[7], 4.0)
     # Gershgorin's bound of the least eigenvalue of n_I . n_J
     xy, xz, yz = abs(dot(n[0], n[1])), abs(dot(n[0], n[2])), abs(dot(n[1], n[2]))
@@ -391,18 +398,3 @@ def rest_concavity(
     a = max(mixed - of_slopes, 0.0)
     b = max(mixed * mixed / max(of_slopes + a, float(LEAST)) - of_modes, 0.0)
     return a, b
-
-
-@njit(inline="always")
-def _least_and_greatest(c: Eight) -> tuple[float, float]:
-    """Return bounds of the eigenvalues of C in a cell's constants (Smith 1961)."""
-    xx, yy, zz, yz, xz, xy, _, _ = c
-    mean = (xx + yy + zz) / 3.0
-    x, y, z = xx - mean, yy - mean, zz - mean
-    spread = math.sqrt((x * x + y * y + z * z + 2.0 * (yz * yz + xz * xz + xy * xy)) / 6.0)
-    half = 0.5 * (x * (y * z - yz * yz) - xy * (xy * z - yz * xz) + xz * (xy * yz - y * xz))
-    shape = half / max(spread * spread * spread, float(LEAST))
-    angle = math.acos(min(max(shape, -1.0), 1.0)) / 3.0
-    greatest = mean + 2.0 * spread * math.cos(angle)
-    least = mean + 2.0 * spread * math.cos(angle + 2.0 * math.pi / 3.0)
-    return max(least, 0.0), greatest

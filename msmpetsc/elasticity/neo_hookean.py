@@ -283,13 +283,16 @@ def slopes_at(f: Three, mu: float, lame: float, u: int, projected: bool) -> tupl
 
 
 @njit(inline="always")
-def concavity_bounds(c: Floats, k: int, e: Strains, h4: float, u: int) -> tuple[float, float]:
+def concavity_bounds(
+    c: Floats, k: int, e: Strains, h4: float, u: int, spectrum: tuple[float, float]
+) -> tuple[float, float]:
     """Return a, b >= 0: the Hessian's form is at least -a |G|^2 - b |h|^2.
 
     G are the slopes of a displacement, and h its modes XY, XZ and YZ. mu outweighs a part of the
     terms of U' and of W (elasticity.assumed_strain).
 
-    e : strains of positions
+    e        : strains of positions
+    spectrum : least and greatest eigenvalue of C
     """
     f, mu, lame = gradient_of(e, 1.0 / h4), c[k + 104], c[k + 112]
     if not mu > 0.0:
@@ -299,7 +302,7 @@ def concavity_bounds(c: Floats, k: int, e: Strains, h4: float, u: int) -> tuple[
     slope, curvature = _slopes(j, mu, lame, u)
     left = mu - abs(slope) * _coupling_bound(f, j, slope, CONVEX)
     left += min(curvature, 0.0) * inner(n, n)
-    return rest_concavity(rest_constants(c, k), f, e, 1.0 / h4, left)
+    return rest_concavity(rest_constants(c, k), f, e, 1.0 / h4, left, spectrum)
 
 
 @njit(inline="always")

@@ -1,9 +1,9 @@
 """A neo-Hookean solid on a lattice, with the methods that Elasticity needs of a law."""
 
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cached_property
 from types import ModuleType
 
 import numpy as np
@@ -15,6 +15,7 @@ from msmpetsc.backend.arrays import (
     Positions,
     Rows,
     greatest,
+    like,
     on_host,
     to_host,
 )
@@ -47,7 +48,13 @@ from msmpetsc.elasticity.neo_hookean import (
 )
 from msmpetsc.elasticity.springs import add_block
 from msmpetsc.elasticity.vectors import Vector, cofactors, combined
+from msmpetsc.lattice.cell_moments import slopes_and_modes
 from msmpetsc.lattice.lattice import Lattice
+
+# constants of a cell for bounds of concavity [-]; see ``concavity_constants``
+BOUNDS = 18
+# places of C by rows among a cell's constants [-]
+COVARIANCE = [6, 11, 10, 11, 7, 9, 10, 9, 8]
 
 
 @njit(inline="always")
@@ -56,36 +63,49 @@ def _row_of(cells: CellRows, i: int, a: int) -> int:
     return int(cells.nodes[i, a]) if cells.by_node else (i // LANES * 8 + a) * LANES + i % LANES
 
 
-@njit(inline="always")
-def _sizes(a: int, constants: Floats, k: int) -> tuple[float, float]:
-    """Return the norms of the mean slopes and of the modes XY, XZ and YZ of corner a."""
-    g = corner_strain(a, form_of(constants, k))
-    return (
-        math.sqrt(g[0] * g[0] + g[1] * g[1] + g[2] * g[2]),
-        math.sqrt(g[3] * g[3] + g[4] * g[4] + g[5] * g[5]),
-    )
+def concavity_constants(constants: Rows) -> Rows:
+    """Return what bounds of the Hessian's negative part need of cells with these constants.
+
+    They are the shares of the eight corners in |G|^2 and in |h|^2, then the least and the greatest
+    eigenvalue of C: a row (BOUNDS * LANES,) for each row of ``constants`` (k, ROWS * LANES).
+    """
+    of_cells = constants.reshape(-1, ROWS, LANES).swapaxes(1, 2).reshape(-1, ROWS)
+    slopes, modes = slopes_and_modes(of_cells[:, :6])
+    spectrum = np.linalg.eigvalsh(of_cells[:, COVARIANCE].reshape(-1, 3, 3))
+    least, greatest = spectrum[:, :1].clip(0), spectrum[:, 2:]
+    columns = _shares(slopes), _shares(modes[:, :3]), least, greatest
+    rows = np.concatenate(columns, axis=1).astype(np.float32).reshape(-1, LANES, BOUNDS)
+    return rows.swapaxes(1, 2).reshape(-1, BOUNDS * LANES)
+
+
+def _shares(operators: Rows) -> Rows:
+    """Return numbers s (c, 8): |B v|^2 is at most the sum of s_a v_a^2.
+
+    s_a = |b_a| times the norm of the sum of b_a b_a^T / |b_a|, with the columns b_a of B.
+
+    operators : B (c, 3, 8)
+    """
+    lengths = np.linalg.norm(operators, axis=1)
+    weighted = operators / np.maximum(lengths, np.finfo(float).tiny)[:, None]
+    norms: Rows = np.linalg.eigvalsh(weighted @ operators.swapaxes(1, 2))[:, -1:]
+    return lengths * norms
 
 
 @kernel
 def _add_concavity(
-    first: int, count: int, step: int, concavity: Rows, cells: CellRows, q: Positions
+    first: int, count: int, step: int, concavity: Rows, cells: CellRows, c: Floats, q: Positions
 ) -> None:
     """Add each cell's share of the concavity bound to its corners.
 
-    With g_a the mean slope of corner a, |G|^2 <= sum_a |g_a| (sum_b |g_b|) |v_a|^2, and the same
-    for modes.
+    c : ``concavity_constants``, flat
     """
     for i in range(first, count, step):
         k, e = constants_at(cells, i), strains_at(q, cells, i)
-        slopes, modes = 0.0, 0.0
+        at = int(cells.which[i // LANES]) * BOUNDS * LANES + i % LANES
+        spectrum = c[at + 16 * LANES], c[at + 17 * LANES]
+        slopes, modes = concavity_bounds(cells.constants, k, e, cells.h4, cells.u, spectrum)
         for a in range(8):
-            slope, mode = _sizes(a, cells.constants, k)
-            slopes += slope
-            modes += mode
-        of_slopes, of_modes = concavity_bounds(cells.constants, k, e, cells.h4, cells.u)
-        for a in range(8):
-            slope, mode = _sizes(a, cells.constants, k)
-            bound = of_slopes * slopes * slope + of_modes * modes * mode
+            bound = slopes * c[at + a * LANES] + modes * c[at + (8 + a) * LANES]
             concavity[_row_of(cells, i, a), 0] += bound
 
 
@@ -181,6 +201,10 @@ class NeoHookean:
         rows = self.blocks.constants.reshape(-1, ROWS, LANES)
         return rows[:, ROWS - 2], rows[:, ROWS - 1]
 
+    @cached_property
+    def _concavity_constants(self) -> Rows:
+        return like(self.blocks.nodes, concavity_constants(to_host(self.blocks.constants)))
+
     @property
     def stiffest(self) -> float:
         """The greatest ratio lambda / mu of a cell [-]."""
@@ -208,11 +232,11 @@ class NeoHookean:
 
     def add_concavity(self, q: Positions, concavity: Floats) -> None:
         """Add a bound of the Hessian's negative part to ``concavity`` (l,) [N/m]."""
-        cells = one_by_one(self.blocks)
+        cells, c = one_by_one(self.blocks), self._concavity_constants.ravel()
         of_nodes = concavity.reshape(-1, 1)
         count = len(cells.nodes)
         add_corners(
-            lambda rows: _add_concavity(count, rows, cells, q),
+            lambda rows: _add_concavity(count, rows, cells, c, q),
             self.blocks.around,
             8 * count,
             of_nodes,

@@ -65,7 +65,7 @@ class Thickness:
 
 def thickness_words(cells: Mapping[str, float]) -> str:
     """Return a phrase on a thickness in cells."""
-    return f"{cells['median']:.3g} cells thick, {cells['thin']:.2g} at its thin tenth"
+    return f"{cells['median']:.3g} cells thick, {cells['thin']:.3g} at its thin tenth"
 
 
 def thickness_of(surface: Surface, report: SurfaceReport) -> Thickness | None:

@@ -3,8 +3,8 @@
 The counts give ranks equal parts of cells and nodes along the Morton curve. The parts of a run,
 made by sampling (geometry.partition.SortedKeys), agree with these within an eighth.
 
-The memory of a rank is the program plus the larger of two peaks: FACTOR times the arrays during
-the assembly of A, and the construction of W.
+The memory of a rank is the program plus the larger of two peaks: that of a step, which is
+proportional to the nodes, and that of the construction of W.
 """
 
 import argparse
@@ -41,12 +41,11 @@ MOST_BUILT = 200_000
 # largest number of ranks [-]; far above any machine
 MOST_RANKS = 10**6
 GB = 1e9
-# memory of a rank without arrays [byte]; measured in runs with the preset newton
-PROGRAM = 0.29e9
-# peak memory over the arrays of a rank [-]; measured in runs with the preset newton
-FACTOR = 2.1
-# memory of the lattice for a cell, a node (ghosts included) and a spring [byte]
-BYTES = np.array([113, 43, 24])
+# memory of a rank beside its nodes [byte]; this and the next three were measured in
+# runs of 3,000 to 350,000 nodes
+PROGRAM = 0.3e9
+# memory of a node, ghosts included [byte]: of a solid, of springs, and with A
+OF_SOLID, OF_SPRINGS, WITH_A = 2400, 3200, 3900
 # peak memory for a surface point with 64 weights while W is made [byte]; measured with
 # the embedding "affine"
 BYTES_OF_POINT = 14 * 64 * 8
@@ -106,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
     report = {
         "scene": str(args.scene), "ranks": args.ranks, "counted": counted,
         "counts": counts_of(scene, partition),
-        "memory": over_ranks(memory_of(partition, stored, mesh_bytes)), "groups": groups,
+        "memory": over_ranks(memory_of(scene, partition, stored, mesh_bytes)), "groups": groups,
         "thickness": [body.thickness and body.thickness.cells(cell_size) for body in bodies],
     }  # fmt: skip
     if args.json:
@@ -116,22 +115,23 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def memory_of(partition: Partition, surfaces: Sequence[Surface], mesh_bytes: float) -> Floats:
+def memory_of(
+    scene: Scene, partition: Partition, surfaces: Sequence[Surface], mesh_bytes: float
+) -> Floats:
     """Return the estimated memory (R,) of each rank [byte].
 
     surfaces   : surfaces that the result stores
     mesh_bytes : memory that reading and preparing the meshes took, on rank 0 [byte]
     """
     # PETSc must get its options before it is imported
-    from msmpetsc.solve.linear.operators import assembly_bytes
-    from msmpetsc.solve.linear.unknowns import BYTES_OF_NODE
+    from msmpetsc.solve.presets import find_preset
 
-    nodes = partition.nodes + partition.ghosts
-    springs = partition.springs
-    arrays = BYTES @ np.array([partition.cells, nodes, springs]) + nodes * BYTES_OF_NODE
-    arrays += assembly_bytes(nodes, springs, partition.nonzeros)
+    of_node = OF_SPRINGS if scene.material.law == "linear" else OF_SOLID
+    if not find_preset(scene.solver.preset).true_hessian:
+        of_node = WITH_A
+    step = of_node * (partition.nodes + partition.ghosts)
     points = sum(len(surface.points) for surface in surfaces)
-    needed: Floats = PROGRAM + np.maximum(FACTOR * arrays, BYTES_OF_POINT * points / len(nodes))
+    needed: Floats = PROGRAM + np.maximum(step, BYTES_OF_POINT * points / len(step))
     needed[0] = max(needed[0], PROGRAM + mesh_bytes)
     return needed
 

@@ -206,18 +206,6 @@ def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, prefix: str =
     return matrix
 
 
-def assembly_bytes(
-    nodes: float | Array, springs: float | Array, nonzeros: float | Array
-) -> float | Array:
-    """Return the peak memory [bytes] of ``assemble`` beside its arguments.
-
-    A node takes its row; a spring its weight, ends and mask. A nonzero takes row, column and value,
-    then the indices of COO, then index and value of CSR. The arguments are numbers, or arrays with
-    a number for each rank.
-    """
-    return 8 * nodes + (8 + 4 * 4 + 2) * springs + (3 * 8 + 2 * 4 + 4 + 8) * nonzeros
-
-
 def python_matrix(unknowns: Unknowns, context: object, comm: PETSc.Comm) -> PETSc.Mat:
     """Return a MATPYTHON with this context on vectors of unknowns (collective)."""
     size = (3 * unknowns.size, 3 * unknowns.total)

@@ -25,8 +25,6 @@ LARGEST = int(np.iinfo(PETSc.IntType).max)
 ADVICE = "a PETSc configured with --with-64-bit-indices can"
 # inertia of static nodes in multigrid, over mass; a flat cell has a singular block
 BALLAST = 1e-6
-# memory of ``numbers`` [bytes per node]; forecasts of memory need it
-BYTES_OF_NODE = 8
 
 
 class Unknowns:

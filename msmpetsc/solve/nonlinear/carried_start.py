@@ -32,8 +32,8 @@ from msmpetsc.solve.nonlinear.jacobian import Jacobian
 PATIENCE = 20
 # Least progress in s between checks; with less progress the step is refused
 PROGRESS = 0.1
-# Corrections at fixed s after each share; a correction doubles a gap that the share has
-# closed
+# Corrections at fixed s before each share; a correction doubles a gap that the last
+# share has closed
 CORRECTIONS = 2
 
 
@@ -47,7 +47,7 @@ class CarriedStart:
 
     def __init__(self, functional: StepFunctional, jacobian: Jacobian, ksp: PETSc.KSP):
         self.functional, self.jacobian, self.ksp = functional, jacobian, ksp
-        # Tolerances of the options; a direction only has to arrive
+        # Tolerances of the options, since Newton's method changes those of ``ksp``
         self.rtol, _, _, self.most_its = ksp.getTolerances()
 
     def find(self, guess: Positions, drift: Callable[[Rows], Rows | float]) -> Positions:
@@ -95,7 +95,10 @@ class CarriedStart:
         return contacts.obstacles.carried(q, moved, times, distances, functional.lattice.cell_size)
 
     def _cushion(self, contacts: ContactSearch) -> float:
-        """Return the distance [m] from which obstacles push: the longest move of a moving part."""
+        """Return the distance [m] from which obstacles push.
+
+        It is the longest displacement of an anchor or obstacle along an axis, dhat at least.
+        """
         problem, obstacles = (
             self.functional.problem,
             contacts.obstacles.displacements(contacts.begin, contacts.time),
@@ -138,7 +141,7 @@ class CarriedStart:
         )
 
     def _direction(self, q: Positions, fixed: Rows, obstacles: Rows) -> Rows:
-        """Return Newton's direction (l, 3) [m] at q (l, 3) [m], with the fixed nodes.
+        """Return Newton's direction (l, 3) [m] at q (l, 3) [m], fixed nodes included.
 
         fixed, obstacles : displacements of fixed nodes (l, 3) and obstacles' points (o, 3) [m]
         """

@@ -1,8 +1,8 @@
 """Lowest curvature of a step's true Hessian H = M + t^2 (Hessian of E).
 
-F vanishes on a saddle of g, too, and a symmetric start never leaves the saddle. H is positive
-definite if no spring or cell is compressed enough, which a pass over them tells. Otherwise the
-lowest eigenvalue of M^(-1) H is computed (nonlinear.lobpcg). A long search is made if the
+F vanishes on a saddle of g, too, and a symmetric start never leaves the saddle. A pass over springs
+or cells bounds the negative parts of H. If they are small enough, H is positive definite. Otherwise
+the lowest eigenvalue of M^(-1) H is computed (nonlinear.lobpcg). A long search is made if the
 compression has grown or if a solve has met a negative curvature. At all other steps a few
 iterations follow the last mode if its curvature has changed.
 """
@@ -39,7 +39,7 @@ UNCHANGED = 0.1
 
 
 class Alarm(IntEnum):
-    """Place of a negative curvature that a solve has met, if any."""
+    """Place of a negative curvature that a solve has met: here, or at an earlier iterate."""
 
     NOWHERE = 0
     ON_THE_WAY = 1

@@ -6,9 +6,9 @@ The relative error of x is |x - x*|_M / |x - y|_M. Two numbers stand for the err
 2. The Newton correction at x is the error up to terms of second order (error_estimate). Newton's
    linear solve finds it on its way. Other methods solve for it once the bound is near the goal.
 
-The next linear solve reduces its residual by
+The next linear solve reduces its residual by the factor
 
-    rtol = min(ksp_rtol, max((|F_k| / |F_(k-1)|)^2, goal / (2 error)))
+    rtol = min(ksp_rtol, max((|F_k| / |F_(k-1)|)^2, goal / (2 error), ksp_rtol / 1000))
 
 (Eisenstat and Walker 1996, Choosing the Forcing Terms in an Inexact Newton Method, Choice 2; Kelley
 1995, Iterative Methods for Linear and Nonlinear Equations, Eq. 6.20).
@@ -31,7 +31,8 @@ FULL_STEP_ERROR = 1e-5
 FIRST_RATIO = 5.0
 # Ratio of |F| to the last |F| above which F may be rounding of stiff contact
 STAYS = 0.5
-# Factor on the goal after a doubt, and its least value
+# Factor on the goal after a doubt. Least goal over the target, and least tolerance of a
+# linear solve over ksp_rtol
 CLOSER, CLOSEST = 0.1, 1e-3
 # DIVERGED_FNORM_NAN, which PETSc 3.25 renames
 NOT_FINITE = -4
@@ -61,10 +62,10 @@ class Outcome:
     bound       : upper bound of the relative error, by |F|_(M^-1)
     residual    : |F|_(M^-1) of the iterate
     distance    : |x - y|_M of the iterate
-    reduction   : residual over that of the iterate before
+    reduction   : residual over the residual of the iterate before
     corrected   : whether the error was estimated, so that the Newton correction is known
     alarm       : place where a solve has met a negative curvature
-    at_rounding : whether F is rounding and nothing else
+    at_rounding : whether F is rounding alone
     doubts      : number of points found to be no minimum, or farther from it than estimated
     compression : of the iterate; None if not yet computed
     """
@@ -136,7 +137,7 @@ class ErrorControl:
         return replace(now, error=bound / lowest if lowest > 0 else np.inf)
 
     def at_rounding(self, iterate: Iterate, now: Outcome) -> Outcome:
-        """Return the outcome at an iterate below which g has no digits: F may be rounding."""
+        """Return the outcome at an iterate from which no step lowers g: F may be rounding."""
         return replace(now, at_rounding=self.rounding.explains(iterate, True))
 
     def is_near(self, now: Outcome) -> bool:
@@ -171,7 +172,7 @@ class ErrorControl:
     def measured(self, iterate: Iterate, now: Outcome, trust: float = 1.0) -> Outcome:
         """Return the outcome with the error that the last solve for the correction measured.
 
-        trust : lower bound of the share of the error that the correction is
+        trust : lower bound of the correction's norm over the error; 0 if there is none
         """
         estimate = self.estimate
         length = estimate.correction_norm + estimate.missing
@@ -189,11 +190,11 @@ class ErrorControl:
         return min(max(needed, CLOSEST * self.rtol), self.rtol)
 
     def doubt(self, now: Outcome, has_moved: bool) -> Outcome | None:
-        """Return the outcome from which a step goes on after a doubt; None without any gain.
+        """Return the outcome from which a step goes on after a doubt.
 
-        The goal stays after a saddle. Otherwise the goal becomes closer until g has no digits left:
-        a second correction has shown that g is not quadratic, so an error bound of the same size
-        says nothing.
+        The goal stays if the step has left a saddle. Otherwise it becomes closer: a second
+        correction has shown that g is not quadratic, so an error bound of the same size says
+        nothing. Return None if the step has not moved, met no saddle, and its goal is the closest.
 
         has_moved : whether the step goes on from another point
         """
@@ -236,7 +237,7 @@ def not_converged(
 
 
 def no_minimum(now: Outcome, worst: str) -> StepFailed:
-    """Return the failure of a step whose iterates all were doubtful."""
+    """Return the failure of a step that met too many points that are no minimum."""
     seen = (
         "a saddle or a fold"
         if np.isinf(now.error)
@@ -251,7 +252,7 @@ def no_minimum(now: Outcome, worst: str) -> StepFailed:
 
 
 def where_worst(functional: StepFunctional, iterate: Iterate) -> str:
-    """Return words on the node of the greatest F and on inverted cells (collective)."""
+    """Return words on the node of the greatest |F| / m and on inverted cells (collective)."""
     comm, lattice = functional.comm, functional.lattice
     node = node_of_greatest(comm, lattice, *functional.pull(iterate.f))
     return f", worst at {node}{describe_inverted(comm, lattice, iterate.q)}"

@@ -40,7 +40,7 @@ class ErrorEstimate:
     residual   : F - H e of the last estimate
     correction_norm : |e_k|_M of the last estimate [m sqrt(kg)]
     missing    : bound on the part of e that the last estimate has not found [m sqrt(kg)]
-    lowest     : bound on the eigenvalues of M^(-1) H that the last estimate used
+    lowest     : lower bound of the eigenvalues of M^(-1) H that the last estimate used
     convexity  : least eigenvalue of M^(-1) H that the step has met, at most 1
     products   : products with H, multigrid's finest level included, of all estimates so far
     """

@@ -47,8 +47,8 @@ class StepProblem:
     load       : f_ext (owned, 3) [N]
     contact    : penalties that press on the nodes in this step
     prescribed : q_n with anchored nodes where they are after the step (l, 3) [m]; None if they stay
-    rates      : two positions (l, 3) [m] whose difference gives the strain rates of a viscous solid
-                 (elasticity.viscosity.Viscosity.begin)
+    rates      : x^ of a viscous solid, and the positions whose rotation K has, both (l, 3) [m]
+                 (elasticity.viscosity.Viscosity.begin); None if the solid is not viscous
     pressures  : pressures on the lattice's surfaces [Pa]
     system_monitor : called with the first iterate of a solve and its Jacobian; None for no call
     """

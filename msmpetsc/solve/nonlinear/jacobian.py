@@ -38,8 +38,8 @@ class Jacobian:
     owned    : takes the objects to destroy, in the order of their creation
     diagonal : (m,) inertia plus t^2 times the stiffness at rest of this rank's free nodes [kg]
 
-    Raises InputError if A is too large for PETSc or of a type that does not go with the arrays.
-    The same holds if multigrid is asked of A (collective).
+    Raises InputError if A is too large for PETSc, or if its type does not go with the arrays. It
+    also does so if the options ask for multigrid of A (collective).
     """
 
     functional: StepFunctional
@@ -82,7 +82,7 @@ class Jacobian:
         )
 
     def _is_stiff(self) -> bool:
-        """Return whether multigrid takes less time than Jacobi's, and rounding leaves mass."""
+        """Return whether multigrid takes less time than Jacobi's, and rounding keeps the mass."""
         unknowns, mass = self.unknowns, self.unknowns.lattice.mass[self.unknowns.free]
         inertia = unknowns.inertia[unknowns.free]
         ratio = self.comm.allreduce(greatest((self.diagonal - inertia) / mass), MPI.MAX)
@@ -155,7 +155,8 @@ class FrictionDuals:
     See contact.obstacles.node_friction.
 
     contact : of the step in progress; None without any
-    duals   : of the next Hessian; None without contact. Nodes begin with their secants
+    duals   : of the next Hessian; None without contact. A step begins with zeros, the secants, for
+              nodes on obstacles, and with None, their own forces, for pairs of surfaces
     """
 
     def __init__(self) -> None:

@@ -19,8 +19,8 @@ from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 
 # Most iterations of a long search
 LONGEST_SEARCH = 100
-# A long search ends if the curvature has fallen by less than to this share of its value
-# half as many iterations ago
+# A long search ends if the lowest eigenvalue is above this share of its value half as
+# many iterations ago; if it is negative, above the inverse of this share
 SETTLED = 0.95
 TINY = np.finfo(float).tiny
 # Relative eigenvalue of a Gram matrix below which directions are linearly dependent
@@ -79,7 +79,7 @@ class SearchSpace:
         return sums
 
     def combine(self, parts: Rows) -> None:
-        """Replace the directions by combinations ``parts`` (k, used) of them."""
+        """Replace the directions by k combinations of them, of coefficients (k, used)."""
         count, on_device = len(parts), like(self.directions, parts)
         for rows in (self.directions, self.products):
             for chunk in self._chunks():
@@ -90,7 +90,7 @@ class SearchSpace:
 class Lobpcg:
     """Search for the lowest eigenvalues of M^(-1) H. All methods are collective.
 
-    its : iterations, a direction each, of all searches so far
+    its : new directions of all searches so far; an iteration has one for each mode
     """
 
     def __init__(
@@ -188,8 +188,8 @@ class Lobpcg:
     def _ritz(self, space: SearchSpace, size: int) -> Floats:
         """Return the lowest Ritz values (size,) in a space, ascending, and reduce the space.
 
-        It keeps the Ritz vectors, of unit length. Their parts outside the first ``size``
-        directions, the conjugate directions, follow.
+        The space then has the Ritz vectors, of unit length. After them come the conjugate
+        directions: the parts of the Ritz vectors outside the first ``size`` directions.
         """
         grams = self.comm.allreduce(space.grams(self.functional.mass))
         lengths = np.sqrt(np.maximum(grams[1].diagonal(), TINY))

@@ -83,7 +83,10 @@ class StepMethod(ABC):
             self.ksp.setTolerances(rtol=self.control.tolerance(outcome))
 
     def finish(self, iterate: Iterate, outcome: Outcome) -> Outcome:
-        """Return the final outcome by SNES's reason. Raises StepStopped and StepFailed."""
+        """Return the final outcome, its error estimated if SNES converged without an estimate.
+
+        Raises StepStopped and StepFailed if SNES did not converge.
+        """
         reason = self.snes.reason
         if reason > 0 and not (outcome.corrected or outcome.error <= outcome.goal):
             goal = 0.0 if reason == REASON.CONVERGED_ITS else outcome.goal

@@ -6,9 +6,9 @@
 
 until the error of x_k is below the goal (error_control). Under compression H may be indefinite. CG
 then stops with the descent direction found so far. If CG's first direction has a negative
-curvature, g rises along y for every s. Then the projected Hessian, without negative parts, takes
-over for some iterations. It also does if the surface would cross something almost at once along a
-direction that CG left unfinished: such a direction closes gaps whose stiffness CG has not met yet.
+curvature, no s lowers g. Then the projected Hessian, without negative parts, takes over for some
+iterations. It also takes over if CG stopped at an indefinite H and the surface would cross
+something almost at once along y: such a y closes gaps whose stiffness CG has not met yet.
 """
 
 from dataclasses import dataclass, replace
@@ -31,7 +31,7 @@ from msmpetsc.solve.petsc.events import LOCAL
 # is tried
 PROJECTED = 5
 # Growth of |F| in the first iteration of a static state beyond which softer solids come
-# first
+# first; and ratio of lambda from such a solid to the next
 SOFTER = 9.0
 # Share of the slope by which a step must lower g (Armijo)
 ALPHA = 1e-4
@@ -41,7 +41,7 @@ LEAST, MOST = 0.1, 0.5
 SHORTEST = 1e-6
 # Share of its slope that a direction must keep when it is bent at obstacles
 DOWNHILL = 0.1
-# Share before a crossing of a direction of an indefinite H [-], below which the
+# Collision-free step length [-] along a direction of an indefinite H, below which the
 # projected Hessian takes over
 STUCK = 0.01
 # Options of PETSc's own convergence test of a linear solve
@@ -67,7 +67,7 @@ class Newton(StepMethod):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        # The direction of the loop is the correction of the error's estimate
+        # The search direction is also the correction of the error estimate
         self.y, self.end = self.control.estimate.correction, self.functional.vectors.take()
         # SNES would create a vector of its own
         self.snes.setFunction(None, self.control.estimate.residual)
@@ -170,8 +170,8 @@ class Newton(StepMethod):
     def _tells_error(self, now: Iterate, outcome: Outcome, projected: int) -> bool:
         """Return whether the next linear solve tells the error.
 
-        With contact it does so near the goal only. Before, duals stand for the curvature of
-        friction.
+        With contact it does so only near the goal. Farther away, duals replace the true curvature
+        of friction.
         """
         is_near = now.contact is None or self.control.is_near(outcome)
         return is_near and self._can_tell_error(projected)
@@ -212,13 +212,13 @@ class Newton(StepMethod):
         return replace(outcome, corrected=tells_error and self.ksp.reason > 0)
 
     def _trust(self, now: Iterate, outcome: Outcome) -> float:
-        """Return a lower bound of the share of the error that y is; 0 if y says nothing of it.
+        """Return a lower bound of |y|_M over the error; 0 if y does not bound the error.
 
-        Contact has kinks that no H predicts: there y counts as the error.
+        Contact has kinks that no H predicts: there |y|_M counts as the error.
 
-        Newton's corrections shrink by about theta if H does not predict a part theta |F(x)| of
-        F(x - y). The error is then at most |y|_M / (1 - theta) (Deuflhard 2011, Newton Methods for
-        Nonlinear Problems, Sect. 2.1).
+        If H misses a part theta |F(x)| of F(x - y), Newton's corrections shrink by about theta.
+        The error is then at most |y|_M / (1 - theta) (Deuflhard 2011, Newton Methods for Nonlinear
+        Problems, Sect. 2.1).
         """
         if now.contact:
             return 1.0
@@ -251,9 +251,9 @@ class Newton(StepMethod):
         return None
 
     def _limit(self, now: Iterate) -> float:
-        """Bend y at obstacles, then shorten it, so that the surface crosses nothing to x - y.
+        """Bend y at obstacles, then shorten it until the surface crosses nothing on it.
 
-        Return the share of the bent y that is left.
+        Return the collision-free step length along the bent y.
         """
         if now.contact is None:
             return 1.0
@@ -293,9 +293,10 @@ class Newton(StepMethod):
 def shorter(slope: float, tried: tuple[float, float], longer: tuple[float, float] | None) -> float:
     """Return the next step length of a line search.
 
-    It is the minimum of the cubic through g(0), its slope and the last two changes of g. After the
-    first trial it is that of the parabola. It is kept within LEAST and MOST of the last length
-    (Dennis and Schnabel 1996, Numerical Methods for Unconstrained Optimization, A6.3.1).
+    The length minimises the cubic through the slope at 0 and the last two changes of g. After the
+    first trial it minimises the parabola. It is between LEAST and MOST times the last length
+    (Dennis and Schnabel 1996, Numerical Methods for Unconstrained Optimization, A6.3.1). If the
+    last change is not finite, it is LEAST times the last length.
 
     slope  : derivative of g by the step length at 0
     tried  : last step length and change of g there

@@ -24,8 +24,8 @@ CONVEX = 0.5
 SMALL = 0.3
 # Factor on an error that both corrections disagree on
 DOUBTFUL = 30.0
-# Ratio of a slope to the curvature's share in the first move; a smaller slope may be
-# rounding
+# Ratio of the slope of g to the change of slope over the first move; a smaller slope
+# may be rounding
 SLOPE = 0.25
 # First move off a saddle [cells], doubled while g falls or halved until g falls; and
 # most moves
@@ -94,7 +94,7 @@ class Optimality:
         value = min(value, 1.0)
         estimate.convexity = min(estimate.convexity, value)
         rest = functional.dual_norm(examined.f) / value
-        # An upper bound if g stays as convex
+        # An upper bound if g is as convex on the way to the minimum
         if value > CONVEX and length + rest <= acceptable:
             return Verdict(
                 self.rounding.relative(length + rest, functional.distance(examined.q)), examined
@@ -133,9 +133,9 @@ class Optimality:
     ) -> float:
         """Return the relative error of the iterate by two corrections, the first of norm ``first``.
 
-        If the second correction crosses the surface, g is not quadratic along it, and the error
-        may be far larger. CG may break down on an F of rounding alone: then the bound stands for
-        the second correction if the curvature allows, else the error is infinite.
+        If the surface meets itself along the second correction, g is not quadratic along it, and
+        the error may be far larger. If F is rounding alone, CG may break down. Then ``bound``
+        replaces the second correction, or the error is infinite if ``lowest`` is at most CONVEX.
         """
         functional, estimate, relative = self.functional, self.estimate, self.rounding.relative
         distance = functional.distance(examined.q)
@@ -165,7 +165,7 @@ class Optimality:
     def _descend(self, at: Iterate, direction: Floats, curvature: float) -> Iterate | None:
         """Return an iterate of lower g along a direction (n,) of negative curvature.
 
-        None if g rises.
+        Return None if g rises.
         """
         functional, base = self.functional, at.q
         slope = functional.comm.allreduce(float(self.memory.read(at.f) @ direction))

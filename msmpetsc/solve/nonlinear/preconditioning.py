@@ -2,8 +2,8 @@
 
 With Jacobi's preconditioner CG takes about sqrt(kappa) / 2 ln(2 / rtol) iterations. In free space
 kappa = 2 (1 + t^2 k / m), k the stiffness of the springs at a node. Multigrid takes about four
-iterations for any kappa, each of them several times as dear. So short steps use Jacobi's
-preconditioner, and all others use multigrid.
+iterations for any kappa, each of which costs several times as much. So short steps use Jacobi's
+preconditioner, and longer steps use multigrid.
 """
 
 import numpy as np

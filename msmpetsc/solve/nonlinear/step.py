@@ -38,7 +38,7 @@ from msmpetsc.solve.work import Work
 DOUBTS = 100
 # Options of SNES that the loop of Newton's method (nonlinear.newton) does not use
 OF_SNES = ("snes_type", "snes_linesearch", "snes_ksp_ew", "npc_snes")
-# PETSc's names of that loop, which a run that goes on from another method may give
+# Options of SNES that name this very loop, and are accepted
 LOOP = {"snes_type": "newtonls", "snes_linesearch_type": "bt"}
 
 
@@ -52,16 +52,17 @@ class StepResult:
     work         : work of obstacles that struck this rank's nodes [J]
     explicit     : whether the step was taken in explicit substeps; ``work`` then includes all that
                    moved or pushed
-    swing        : change of the recoverable energy of this rank's nodes (solve.energy_balance) [J]
+    swing        : known change of energy as the scheme oscillates, of this rank's nodes
+                   (solve.energy_balance) [J]
     static       : whether the result is an equilibrium, not a motion
     time_error   : estimated error of the trajectory so far; NaN without an estimate
     problem      : F = M (x - y) + tau^2 (grad E - f_ext), without M in statics; None if explicit
     energy_tolerance : energy [J]; if g / tau^2 is this close to its minimum, x meets the error
     tau          : [s]
     viscous      : forces of viscosity (owned, 3) [N]
-    begun_error  : error of a history that the step had to make up (solve.integrators.implicit.Bdf2)
-                   [m sqrt(kg)]
-    viscous_work : energy that viscosity took in of this rank's cells [J]
+    begun_error  : error of the history that a BDF2 step without history computes for itself
+                   (solve.integrators.implicit.Bdf2) [m sqrt(kg)]
+    viscous_work : energy that viscosity dissipated in this rank's cells [J]
     """
 
     position: Positions
@@ -144,7 +145,7 @@ class Stepper:
         """Create the SNES, and return its KSP or the KSP of the SNES that preconditions it."""
         snes, prefix = self._keep(PETSc.SNES().create(self.comm)), self.prefix
         snes.setOptionsPrefix(prefix)
-        # A plain iteration that preconditions SNES
+        # Whether a plain iteration preconditions SNES
         has_npc = self.options.is_given("npc_snes_type")
         if self.preset.true_hessian:
             self._refuse_of_snes()
@@ -152,7 +153,7 @@ class Stepper:
         ksp = self._keep(inner.getKSP())
         ksp.setOptionsPrefix(prefix)
         pc = self._keep(ksp.getPC())
-        # The preconditioner of A has the bare -pc_
+        # The bare options -pc_ are for the preconditioner inside, of A or of H
         pc.setOptionsPrefix(f"{prefix}three_columns_")
         pc.setType(PETSc.PC.Type.PYTHON)
         pc.setPythonContext(self.jacobian.preconditioner)
@@ -208,7 +209,7 @@ class Stepper:
         Raises InputError for a preconditioner that this PETSc or matrix does not have.
         """
         with petsc_errors("PETSc cannot set up the solver", self):
-            # Chebyshev's method applies it for eigenvalue bounds
+            # Chebyshev's method applies the operator for eigenvalue bounds
             self.jacobian.hessian.linearise(self.lattice.nodes, None)
             self.jacobian.preconditioner.prepare(self.lattice.nodes, None)
             self.ksp.setOperators(self.jacobian.operator)
@@ -253,9 +254,9 @@ class Stepper:
             return self.functional.at(guess)
 
     def _first(self, start: Iterate, outcome: Outcome) -> tuple[Iterate, Outcome]:
-        """Reduce F to the goal from the start of a step (collective).
+        """Minimise g from the start of a step (collective).
 
-        If the first iteration of a static state overshoots, solids of a smaller lambda come first.
+        If the first iteration of a static state overshoots, minimise with smaller lambdas first.
 
         Raises StepFailed and InputError.
         """
@@ -276,12 +277,12 @@ class Stepper:
         )
 
     def _softened(self, newton: Newton, now: Iterate) -> Iterate:
-        """Return the solution with the greatest lambda below the solid's own.
+        """Return the solution with the greatest of several lambdas below the solid's own.
 
-        Lambda is mu at first, then grows by SOFTER from solution to solution. A straight way to the
-        solution changes volumes more the greater lambda is; between these solutions volumes change
-        little. The first Hessian of each solve has the pressure of the solution before it, since
-        the pressure of its own lambda would bend everything.
+        Lambda is mu at first, then grows by the factor SOFTER from solution to solution. A straight
+        step changes volumes, which resist in proportion to lambda; between these solutions volumes
+        change little. The first Hessian of each solve keeps the slopes V U' of the last solution,
+        since its own lambda would make them far too large.
 
         Raises StepFailed.
         """
@@ -345,8 +346,8 @@ class Stepper:
     ) -> tuple[Iterate, Outcome] | None:
         """Return an iterate of lower g and its outcome so far (collective).
 
-        Return None if g has no digits left to tell the iterates apart. The error of the step is
-        then that of the verdict.
+        Return None if the step can neither move nor become more accurate. The step then ends with
+        the error of the verdict.
 
         Raises StepFailed.
         """

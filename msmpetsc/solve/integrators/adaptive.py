@@ -6,7 +6,8 @@ The local error of a step follows from positions q and velocities v at its ends:
     BDF2            8/5 (q_(n+1) - q_n - t/2 (v_n + v_(n+1)))      = 2/9 t^3 da/dt + O(t^4)
 
 A BDF2 step without history has a further error (``Bdf2``).
-``StepControl`` sums the root mean squares of local errors, and the errors of contact (README).
+``StepControl`` sums the root mean squares of local errors. It also counts impacts and changes of
+the force of penalties (scripts/docs/pages/time-steps.md).
 
 If U is the size of the motion, the trajectory error of the run may reach ``error`` U. Each step
 spends its local error from a credit that grows with the motion and with time:
@@ -37,7 +38,7 @@ from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.recovery import take_step
 from msmpetsc.solve.work import Work
 
-# levels of the shortest and the longest step; 1/1024 and 64 times the scene's step
+# levels of the shortest and the longest step, 1/1024 and 64 times the scene's step
 LOWEST, HIGHEST = -10, 6
 # number of step lengths whose integrators are kept; neighbouring lengths alternate
 KEPT = 4
@@ -100,7 +101,7 @@ class StepControl:
     step, duration  : length of a step of level 0, and of the run [s]
     calm            : consecutive steps that would have allowed a longer step
     motion          : size of the motion so far [m]
-    passed          : mean of the motion's size over the duration [m], later steps counted as 0
+    passed          : integral of the motion's size up to now, over the duration [m]
     spent           : sum of local errors [m]
     steps, time     : number of accepted steps, and their total length [s]
     """
@@ -209,8 +210,9 @@ class Ticks:
 class Adaptive(Integrator):
     """Take the scene's steps as adaptive steps, which may be shorter or longer.
 
-    A state has the velocity (q_n - q_(n-1)) / t with the scene's step t. Its time may lie beyond
-    the scene's step, at the end of a longer step. Its history is the start of the last step.
+    A state has the velocity (q_n - q_(n-1)) / t with the scene's step t. If the last step was
+    longer than the scene's, the state's time lies beyond the frame. Its history is the start of
+    the last step.
 
     integrators : level -> integrator; the integrator used last comes last
     tick        : time of the state (Ticks)
@@ -358,7 +360,7 @@ class Adaptive(Integrator):
         coming = t * v
         if not self.control.motion:
             coming = self.time_step * w + 0.5 * self.time_step**2 / t * (w - v)
-        # An impact or a change of contact force may come anywhere within the step.
+        # An impact or a change of contact force may come at any time within the step.
         late = t * (mass @ np.sqrt((free * struck**2).sum(axis=1)))
         if self.environment.obstacles.penalties:
             ends = (before.q[owned], before.sides), (x, after.sides)

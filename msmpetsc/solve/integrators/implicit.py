@@ -34,9 +34,11 @@ from msmpetsc.solve.petsc.events import CONTACT
 from msmpetsc.solve.presets import find_preset
 from msmpetsc.solve.work import Work
 
-# most solves of a step for its contacts; nodes may pass through a thin obstacle
+# most solves of a step to settle its contact faces; with others nodes may pass through
+# a thin obstacle
 MOST_SOLVES = 10
-# energy of surface pairs left out, over that of the error; x moves by 0.01 of the error
+# energy of surface pairs that may be left out, over the energy tolerance of the step; x
+# then moves by 0.01 of the error
 LEFT_OUT = 1e-4
 
 
@@ -45,12 +47,12 @@ class ContactFaces:
     """Find the obstacle faces at which nodes are in contact in a step. All methods are collective.
 
     The first solve takes the faces that nodes cross on the path from q to y. If the path to the
-    solution x crosses other faces, the step is solved again. From then on a node keeps its face, so
-    that the search ends.
+    solution x crosses other faces that push otherwise, the step is solved again. From then on a
+    node keeps its face, so that the search ends.
 
-    If the surface has few contacts at the start, the first solves take only candidate pairs around
-    these contacts. If there are no contacts, they take none. If the solution shows other contacts,
-    the step is solved again. This replaces a broad phase at each iterate.
+    If the surface has few contacts at the start, the first solves use only candidate pairs around
+    these contacts. Without contacts they use no pairs. If the solution shows other contacts, the
+    step is solved again. This replaces a broad phase at each iterate.
 
     q, y       : as in StepProblem
     load       : external forces
@@ -61,7 +63,8 @@ class ContactFaces:
     is_settled : whether the last solve had the right contacts
     contact    : contact of the last solve
     start      : (l, 3) [m] solution that the next solve may start from
-    end        : (l, 3) [m] solution whose normal forces set friction, if they changed much
+    end        : (l, 3) [m] earlier solution, whose normal forces set friction; None for the forces
+                 at q
     """
 
     environment: Environment
@@ -194,7 +197,7 @@ class ImplicitEuler(Integrator):
     def _rates(
         self, q: Positions, y: Positions, q_before: Positions | None
     ) -> tuple[Positions, Positions] | None:
-        """Return x^ of a viscous solid and the positions (l, 3) [m] whose rotation its rates have.
+        """Return x^ of a viscous solid and the positions whose rotation K has, (l, 3) [m] each.
 
         Return None if the solid is not viscous.
         """
@@ -258,7 +261,7 @@ class ImplicitEuler(Integrator):
         return self._with_viscosity(result), faces.sides
 
     def _with_viscosity(self, result: StepResult) -> StepResult:
-        """Return a step's result with the viscous forces [N] and their work [J] at anchors."""
+        """Return a step's result with the viscous forces and the fall of D (StepResult)."""
         viscosity, problem = self.stepper.functional.elasticity.viscosity, result.problem
         if viscosity is None or problem is None:
             return result
@@ -340,9 +343,9 @@ class Bdf2(ImplicitEuler):
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         """Take the step that ends at ``time`` [s] (collective). Raises StepFailed.
 
-        A node that rebounds keeps its position. Its new history leads there with the new velocity
-        and the present acceleration, which its neighbours feel. Without the acceleration, an impact
-        would add energy.
+        A node that rebounds keeps its position. Its new history leads to this position with the new
+        velocity and with the node's present acceleration. Without the acceleration, an impact would
+        add energy.
         """
         self._let_go(time)
         q, v, work_before = state.q, state.velocity(self.time_step), Work()
@@ -397,7 +400,7 @@ class Bdf2(ImplicitEuler):
         return history, self._begun_error(result), result.cost
 
     def _begun_error(self, result: StepResult) -> float:
-        """Return the error [m sqrt(kg)] of the history that an implicit Euler step leads to."""
+        """Return the error [m sqrt(kg)] of the history that ``_history`` makes of this result."""
         functional, problem = self.stepper.functional, result.problem
         assert problem is not None
         moved = functional.vectors.take()

@@ -10,8 +10,8 @@ rest has no eigenvalue far below 1. Error bounds of implicit steps rely on the s
 
 If the whole load fails or turns cells inside out, which springs cannot turn back, it is applied in
 load steps. The load of share s, from 0 to 1, is f_ext + (1 - s) r. The holding force
-r = grad E(x_0) - f_ext keeps the state before, x_0, in place. An initial state is no equilibrium.
-If the whole load fails from it or leaves folds, x_0 is the rest shape.
+r = grad E(x_0) - f_ext keeps the last state, x_0, in place. A start that the scene gives is no
+equilibrium. If the whole load fails from this start or leaves folds, x_0 is the rest shape.
 """
 
 from dataclasses import dataclass, replace
@@ -38,11 +38,11 @@ from msmpetsc.solve.petsc.library import petsc_errors
 from msmpetsc.solve.recovery import Halving
 from msmpetsc.solve.work import Work
 
-# first tau, over the time of sound along the body; slender bodies are slower
+# first tau, over the time that sound takes along the body; slender bodies are slower
 SLENDER = 10.0
 # lowest eigenvalue of M^(-1) tau^2 (Hessian of E) that tau aims at; 1 with a margin
 LOWEST = 10.0
-# lowest eigenvalues that need no other tau; another tau needs a new solver
+# lowest eigenvalues between which tau stays; another tau needs a new solver
 ACCEPTED_LOWEST = 1.0, 1e3
 # halvings of a load step beyond which smaller steps hardly help
 SMALL = 4
@@ -108,7 +108,7 @@ class LoadPath:
         return self.stepper.step(problem, self._guess(problem, share))
 
     def _problem(self, whole: StepProblem, share: float) -> StepProblem:
-        """Return the problem of a share of the load; ``whole`` is that of the whole load."""
+        """Return the problem of a share of the load; ``whole`` is the problem of the whole load."""
         load, prescribed = whole.load, self.target
         if share < 1:
             if self.holding is None:
@@ -157,7 +157,7 @@ class Static(ImplicitEuler):
     problem: StepProblem | None = None
 
     def _first_tau(self) -> float:
-        """Return SLENDER times the time [s] of sound along the longest side (collective)."""
+        """Return SLENDER times the travel time [s] of sound along the longest side (collective)."""
         lattice = self.environment.lattice
         cells = lattice.longest_side() / lattice.cell_size
         sums = np.array([float(lattice.mass.sum()), _stiffness(lattice)])

@@ -10,8 +10,8 @@ Adjacent half kicks are merged, except at the ends of a step, so that a frame ha
 same time. A kick has the mean of f_ext over its duration. The method is stable if dt < 2 / omega,
 where omega^2 is the largest eigenvalue of M^(-1) (Hessian of E).
 
-This limit holds for small oscillations only (README). Beyond them, the substeps gain the error of
-the trapezoidal rule for the work of the springs,
+This limit holds for small oscillations only (scripts/docs/pages/integrators.md). Beyond them, the
+substeps gain the error of the trapezoidal rule for the work of the springs,
 
     E(q_N) - E(q_0) - sum_n 1/2 (grad E(q_n) + grad E(q_(n+1))) . (q_(n+1) - q_n)
 
@@ -50,15 +50,17 @@ from msmpetsc.solve.work import Work
 SAFETY = 0.8
 # most repetitions of a step; they bound the cost of an unstable step
 RETRIES = 4
-# spurious energy that halves the substeps, over all energy; a fifth of NOTABLE_GAIN
+# spurious energy that halves the substep length, over all energy; a fifth of
+# NOTABLE_GAIN
 GAIN = 2e-3
-# gain that doubles substeps, over the limit; doubled substeps gain 4 to 16 times more
+# gain below which the substep length doubles, over the limit; twice as long substeps
+# gain 4 to 16 times more
 EASED = 1 / 32
-# most halvings of the substeps; 32 times the substeps bound the cost
+# most halvings of the substep length; 32 times as many substeps bound the cost
 HALVINGS = 5
 # most substeps of a step; more would take hours
 MOST_SUBSTEPS = 1e6
-# spurious energy that rounding may cause, over the energy of an unstable body
+# spurious energy that rounding may cause, over the least energy of an unstable body
 ROUNDING = 1e-14
 # elastic energy of an unstable body, over that of crushed springs; no load reaches it
 UNSTABLE = 100.0
@@ -72,7 +74,7 @@ class Verlet(Integrator):
     work         : [J] of a step: work of obstacles, varying loads and anchors on this rank's nodes
     springs_work : [J] of a step: work that the springs of this rank's nodes absorb
     gained       : [J] spurious energy of the springs so far, less its dissipation; negative: credit
-    halvings     : halvings of the substeps because of spurious energy
+    halvings     : halvings of the substep length because of spurious energy
     end          : end time of the step [s]
     known        : positions (l, 3) [m] that ``gradient`` and the highest frequency belong to
     """
@@ -208,10 +210,11 @@ class Verlet(Integrator):
         self.work += 0.5 * float(np.vdot(forces, moved))
 
     def _is_to_halve(self, start: Rows, energy: float) -> bool:
-        """Return whether a step gained too much energy, and then halve the substeps (collective).
+        """Return whether a step gained too much energy, and then halve the substep length.
 
-        If the gain is negligible, double the substeps of the next step. With penalty obstacles
-        there is no halving, because the gain of the springs may come from the obstacles.
+        If the gain is negligible, double the substep length of the next step. With penalty
+        obstacles there is no halving, because the springs may gain energy from the obstacles
+        (collective).
 
         start  : (l, 3) [m] positions at the start of the step
         energy : elastic energy [J] at its end

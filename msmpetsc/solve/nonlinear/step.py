@@ -62,7 +62,8 @@ class StepResult:
     viscous      : forces of viscosity (owned, 3) [N]
     begun_error  : error of the history that a BDF2 step without history computes for itself
                    (solve.integrators.implicit.Bdf2) [m sqrt(kg)]
-    viscous_work : energy that viscosity dissipated in this rank's cells [J]
+    viscous_work : fall of the dissipation potential D from ``problem.fixed_positions`` to
+                   ``position``, this rank's part [J]
     """
 
     position: Positions

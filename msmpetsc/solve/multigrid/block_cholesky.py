@@ -12,9 +12,9 @@ class BlockCholesky:
     """Solve with a matrix by its Cholesky factor in blocks (a context of PCPYTHON).
 
     The blocks are those of the matrix: 3 x 3 on a lattice, single numbers in GAMG of A.
-    Blocks take 0.4 of the time of PETSc's factor of an AIJ, whose analysis takes longer than its
-    numbers. PETSc keeps the order of the blocks, so ``order`` (n,) numbers the nodes for little
-    fill. Every PETSc has qmd, and it fills least of the common orderings.
+    Blocks take 0.4 of the time of PETSc's factor of an AIJ, whose symbolic factorisation takes
+    longer than the numeric one. PETSc factors blocks in their given order, so they are permuted by
+    ``order`` (n,) first. Every PETSc has qmd, the common ordering with the least fill.
     """
 
     def __init__(self) -> None:

@@ -4,8 +4,8 @@ The interpolation function of a coarse node spans the fine nodes around it. If t
 several connected parts, the coarse node has a copy for each part. Each fine node then has the
 copies of its part as parents. Fine nodes are connected if they share a cell.
 
-A part of a coarse node is told from its cells alone. So one rank receives all cells around a coarse
-node, and the result does not depend on the number of ranks.
+The parts of a coarse node follow from the cells around the node alone. So one rank receives all
+these cells, and the result does not depend on the number of ranks.
 """
 
 import numpy as np

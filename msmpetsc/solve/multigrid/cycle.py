@@ -8,8 +8,8 @@ CG with the true Hessian has a positive definite preconditioner. The finest leve
 by spring or cell by cell in single precision, with a block diagonal D in its smoother. The first
 coarse matrix is summed in the same way (solve.multigrid.galerkin). PETSc computes the coarser
 matrices as products P^T H P. P is the same for x, y and z. So PETSc multiplies the nine entries of
-the blocks one after the other, as matrices of the nodes. All levels but the coarsest multiply in
-single precision (solve.multigrid.coarse_products).
+the blocks one after the other, as matrices of the nodes. On a CPU all coarse levels but the last
+multiply in single precision (solve.multigrid.coarse_products).
 """
 
 from collections.abc import Iterator
@@ -53,7 +53,8 @@ POINTS = 200
 RANGE_START = 0.25
 # factor on an eigenvalue estimated by ten CG iterations; the estimate is too small
 SAFETY = 1.1
-# increase of coarse diagonals without and with free bodies; see ``_raise_diagonal``
+# relative increase of coarse diagonals, without and with free bodies; see
+# ``_raise_diagonal``
 RAISED = 1e-8, 1e-5
 # first release of PETSc that restricts by the transpose of a square matrix
 TRANSPOSES_SQUARE = (3, 19)
@@ -67,8 +68,8 @@ class Level:
     interpolation : P to the next finer level
     scalar        : P (AIJ) of a single coordinate; None for the first coarse level
     pattern       : AIJ of the nodes, with an entry for each block of the level's matrix
-    matrix        : the level's matrix (AIJ of block size 3). If CoarseOperator multiplies in its
-                    place, it has the diagonal blocks alone
+    matrix        : the level's matrix (AIJ of block size 3), or its diagonal blocks alone if a
+                    CoarseOperator multiplies
     """
 
     grid: CoarseGrid
@@ -244,8 +245,8 @@ class Multigrid:
     def _finest_bound(self) -> float:
         """Return a bound on the eigenvalues of D^-1 H of the finest level, or an estimate by CG.
 
-        The estimate leaves out blocks of contact. As a part of D and of H they raise no eigenvalue
-        above the bound. But they might hide a greater eigenvalue of nodes that later let go.
+        The estimate leaves out blocks of contact, because they might hide a greater eigenvalue of
+        nodes that later lose contact. As a part of D and of H they raise no eigenvalue above it.
         """
         bound, unknowns, contact = self.fine.elasticity.bound, self.unknowns, self.fine.contact
         if bound is not None:
@@ -287,12 +288,12 @@ class Multigrid:
             finer.ptap(level.scalar, level.pattern)
 
     def _raise_diagonal(self, matrix: PETSc.Mat) -> None:
-        """Increase a diagonal of a coarse matrix by RAISED, to make it positive definite.
+        """Increase a diagonal of a coarse matrix by RAISED, to make the matrix positive definite.
 
-        A coarse cell with few fine nodes has linearly dependent columns. The increase fixes coarse
-        nodes to the ground. It must be small for a held slender body, whose bending is as soft. A
-        free body without mass needs more: otherwise a load moves it so far that single precision
-        loses its shape.
+        The columns of P are linearly dependent if a coarse cell has few fine nodes. The increase
+        acts as springs to the ground. They must be soft for a clamped slender body, because bending
+        is soft, too. A free body of negligible mass needs stiffer springs: otherwise a load moves
+        it so far that single precision loses its shape.
         """
         diagonal = matrix.getDiagonal()
         diagonal.scale(1 + RAISED[int(self.bodies.free.any())])
@@ -351,7 +352,8 @@ class Multigrid:
     def _read_options(self) -> None:
         """Read PETSc's options. Raises InputError for a smoother that needs a finest matrix.
 
-        The pc_type may name the preconditioner of the steps, beside which a system is exported.
+        The user's pc_type does not count here: a system may be exported beside steps with another
+        preconditioner.
         """
         options = PETSc.Options(self.prefix)
         for name in ("mg_levels_pc_type", f"mg_levels_{len(self.levels)}_pc_type"):

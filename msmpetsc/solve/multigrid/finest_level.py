@@ -55,7 +55,7 @@ class ProjectedHessian:
         contact : (owned, 9) or (0, 9) [N/m] diagonal blocks of contact
         joined  : contact of the surface that couples nodes
         """
-        # The old Hessian goes before the new one comes
+        # Free the memory of the old Hessian before the new one takes its own
         self.elastic = None
         self.elastic = self.elasticity.hessian_at(q, projected=True, dtype=np.float32)
         self.joined = joined

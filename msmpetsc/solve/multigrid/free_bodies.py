@@ -36,7 +36,7 @@ class Bodies:
     free: Mask
 
     def offsets(self, comm: MPI.Comm, keys: Indices) -> Indices:
-        """Return what to add to the nodes' keys (l,) to separate the bodies (collective).
+        """Return the offsets (l,) to add to the nodes' keys, so that bodies separate (collective).
 
         Shifted along the first axis, bodies share no coarse cell. Pinned nodes have offset 0. If
         the grid indices have no room, all offsets are 0.

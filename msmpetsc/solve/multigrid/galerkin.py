@@ -6,8 +6,8 @@ weights (8,) of the cell's corners at end a of a spring, or 0 if the end is pinn
 
 - a spring with block B: (w_a - w_b)(w_a - w_b)^T (x) t^2 B
 - a node of mass m with contact block C: w w^T (x) (m I + t^2 C)
-- a fixed component of a node that is fixed in part: a spring to the ground, GROUND as stiff as
-  the node
+- a fixed component of a node that is fixed in part: a spring to the ground, GROUND times as stiff
+  as the node
 - a solid cell: its Hessian in the strains of the coarse corners (elasticity.neo_hookean)
 """
 
@@ -46,8 +46,8 @@ PINNED = 27
 UPPER, DIAGONAL = [0, 1, 2, 4, 5, 8], [0, 3, 5]
 # place in a 3 x 3 block of each entry of its transpose
 TRANSPOSED = [0, 3, 6, 1, 4, 7, 2, 5, 8]
-# stiffness of the spring that holds a component on coarse levels, over its node's [-];
-# the coarse matrix must not be much softer than the components that move
+# stiffness of the spring that holds a fixed component on coarse levels, over its node's
+# stiffness [-]; fixed components must be much stiffer than components that move
 GROUND = 100.0
 # entries of a row of ``_write_coarse`` [-]
 COARSE = 41
@@ -84,7 +84,8 @@ class Products(NamedTuple):
 
 
 WEIGHTS = _weights()
-# products of a spring, at 28 times the code of an end plus that of the other end
+# products of a spring, at the index 28 times the code of its first end plus the code of
+# its second end
 OF_SPRINGS = Products.of((WEIGHTS[:, None, :] - WEIGHTS[None, :, :]).reshape(-1, 8))
 # products of a node, at its code
 OF_NODES = Products.of(WEIGHTS)
@@ -95,7 +96,8 @@ class ByCell(NamedTuple):
 
     start : (c + 1,) coarse cell i has the items order[start[i] : start[i + 1]]
     order : (n,) numbers of the items
-    code  : position codes in the coarse cell of each item's ends or corners, in that order
+    code  : (n, k) position codes in the coarse cell of the k ends or corners of each item, in the
+            order of ``order``
     """
 
     start: Indices

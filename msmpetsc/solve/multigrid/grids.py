@@ -87,7 +87,7 @@ def grids(
 def interpolation(keys: Indices, grid: CoarseGrid) -> csr_array:
     """Return the interpolation P of a coordinate to finer nodes with keys (n,) (collective).
 
-    The rows are those nodes, the columns all coarse nodes.
+    The rows are the finer nodes, the columns all coarse nodes.
     """
     parents, needed = parents_of(keys, grid.copies)
     count = needed.sum(axis=1)

@@ -28,7 +28,7 @@ class Interpolation:
     """Apply P from a coarse grid to finer nodes, and P^T (a context of MATPYTHON).
 
     P is the same for x, y and z, and the parents of a node have equal weights. So lists of parents
-    and of children take the place of an AIJ: 32 bytes for 134 a finer node.
+    and of children replace an AIJ: 32 bytes a finer node instead of 134.
 
     parents  : coarse nodes of each finer node, by local numbers
     children : finer nodes of each local coarse node

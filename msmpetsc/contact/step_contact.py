@@ -1,7 +1,7 @@
 """Contact energy of a step: obstacles that nodes meet, and surfaces that meet.
 
-``StepContact.at`` gives its values at positions with the nodes inside each obstacle. Gradient,
-Hessian and bounds share these nodes.
+``StepContact.at`` finds the nodes inside each obstacle at given positions. Gradient, Hessian and
+bounds share these nodes.
 """
 
 from collections.abc import Iterator
@@ -15,7 +15,8 @@ from msmpetsc.contact.obstacles.node_friction import Movers, Pressed, apply_fric
 from msmpetsc.contact.obstacles.penalty import ObstacleContact
 from msmpetsc.contact.surface.surface_contact import SurfaceContact
 
-# depth at which nodes are stopped [fraction]; above 0, so that the Hessian has contact
+# depth at which nodes are stopped, over the depth that they would have [-]; above 0, so
+# that the Hessian has contact
 STOP_DEPTH = 1e-3
 # duals (a, 3) of each obstacle's friction and of the surface's; None for slips' forces
 Duals = list[Rows | None]

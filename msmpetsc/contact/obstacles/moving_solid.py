@@ -51,7 +51,7 @@ class Obstacle(Timed):
     def depths(
         self, q: Positions, time: float, sides: Indices | None = None
     ) -> tuple[Floats, Indices]:
-        """Return the depths (n,) [m] of the surface at nodes q (n, 3) [m], and the faces (n,).
+        """Return depths (n,) [m] of the surface at nodes q (n, 3) [m], and the faces (n,).
 
         sides : (n or more,) sides of the nodes (solids.side_of); None for the nearest face
         """

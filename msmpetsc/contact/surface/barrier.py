@@ -233,7 +233,7 @@ class Barrier:
     def around(self, touched: Mask, points: Positions, margin: float) -> CandidateSets:
         """Return the pairs of parts that have a point in ``touched`` (p,) or next to one.
 
-        The pairs hold while points move by ``margin`` [m] from S (p, 3) [m].
+        The pairs are valid while points are at most ``margin`` [m] from S (p, 3) [m].
         """
         ipctk, corners, near = self.ipctk, (self.mesh.edges, self.mesh.faces), touched.copy()
         near[corners[0][touched[corners[0]].any(axis=1)]] = True
@@ -365,7 +365,7 @@ class Barrier:
         return np.array(numbers, np.int64)
 
     def clearance(self, contacts: ContactSets, sets: CandidateSets, points: Positions) -> float:
-        """Return a lower bound [m] of candidate pairs' distances, by their contacts at S (p, 3)."""
+        """Return a lower bound [m] of the distances of candidate pairs at points S (p, 3) [m]."""
         # A larger distance of obstacles has the same pairs
         known = zip(contacts, sets, self.distances, strict=False)
         least = (

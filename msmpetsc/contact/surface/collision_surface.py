@@ -38,7 +38,8 @@ MOST_CUT = 0.1
 LONG = 2.0
 # Fewest triangles of a body
 FEWEST = 20
-# Speed of the decimation; its default, 7, leaves two to four times the distance
+# Speed of the decimation; with its default, 7, the coarser surface is two to four times
+# as far off
 HASTE = 4
 
 
@@ -92,8 +93,8 @@ def _prepared(
 ) -> tuple[list[Surface], float, float]:
     """Return the contact surfaces, their distance from the bodies' surfaces, and their mean edge.
 
-    The surfaces have about as many triangles as the table asks for, all of them if it does not.
-    Triangles that cross are left out. The distance is the median over the bodies' points [m].
+    The surfaces have about as many triangles as the table asks for; all triangles if it names no
+    number. Crossing triangles are left out. The distance is the median over the bodies' points [m].
 
     Raises InputError if too many triangles cross.
     """

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 RINGS = 3
 # Ratio of successive distances
 FINER = 4
-# Distance of a pair at rest, over the distance from which it pushes
+# Least ratio of a pair's distance at rest to the distance from which it pushes
 ROOM = 2.0
 # Share of dhat; pairs that are closer at rest may cross
 NEAREST = 1e-3
@@ -32,7 +32,8 @@ def neighbours(
 ) -> Mapping[tuple[int, int], bool]:
     """Return {(i, j): False}, i < j, for points of neighbours, which push from smaller distances.
 
-    Neighbours are candidate pairs closer than ``distance`` [m] at rest.
+    Neighbours are candidate pairs closer than ``distance`` [m] at rest, with parts at most RINGS
+    rings of triangles apart.
     """
     of_points = _cross_pairs(
         candidates.fv_candidates, mesh, points, distance, [(0, 1), (0, 2), (0, 3), (0, 3)]
@@ -110,9 +111,9 @@ def creases(
 def _left_out(
     near: Mapping[tuple[int, int], bool], mesh: "ipctk.CollisionMesh", points: int
 ) -> list["ipctk.FaceVertexCandidate | ipctk.EdgeEdgeCandidate"]:
-    """Return the pairs of point and triangle and of two edges whose points are all neighbours.
+    """Return the pairs of parts, a point and a triangle or two edges, whose points are neighbours.
 
-    All points of one part are neighbours of all points of the other part.
+    Each point of one part is a neighbour of each point of the other part.
     """
     import ipctk
 

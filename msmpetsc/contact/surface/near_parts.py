@@ -23,8 +23,8 @@ TYPES = np.array([[0, 1, 6], [2, 3, 7], [0, 2, 4], [1, 3, 5]])
 BETWEEN = 2
 # ipctk's type if both nearest points are between the ends.
 CROSSING = 8
-# Squared sine between edges of rest lengths, below which their barrier fades out;
-# ipctk's value.
+# Squared sine between two edges, by their lengths at rest, below which their barrier
+# fades out; ipctk's value.
 PARALLEL = 1e-3
 # Squared sine below which rounding decides the common normal of two edges.
 NO_NORMAL = 1e-12
@@ -32,13 +32,15 @@ TINY = float(np.finfo(float).tiny)
 
 
 class Mesh(NamedTuple):
-    """Mesh at rest. Areas are a quarter of ipctk's: both surfaces have vertices and edges.
+    """Mesh at rest.
 
-    edges, faces : vertices (e, 2), (f, 3)
-    sides        : edges (f, 3) of triangles
-    areas        : of vertices and edges [m^2]
-    squares      : squared lengths (e,) of edges [m^2]
-    size         : more than any number of a vertex, an edge or a triangle
+    Areas are a quarter of ipctk's, since the vertices and the edges of both surfaces push.
+
+    edges, faces             : vertices (e, 2), (f, 3)
+    sides                    : edges (f, 3) of triangles
+    vertex_areas, edge_areas : (v,), (e,) [m^2]
+    squares                  : squared lengths (e,) of edges [m^2]
+    size                     : more than any number of a vertex, an edge or a triangle
     """
 
     edges: Indices
@@ -55,9 +57,9 @@ class Parts(NamedTuple):
 
     place  : number of the place
     weight : area [m^2]
-    pair   : number of the pair, once for each edge of two; -1 of a nearest place
-    shared : equal numbers link pairs
-    value  : b
+    pair   : number of the pair; two numbers for a pair of edges; -1 for a nearest place
+    shared : parts with equal numbers link their pairs
+    value  : b of a link; infinite for a nearest place
     """
 
     place: Indices
@@ -123,7 +125,7 @@ def _place_on_edge(mesh: Mesh, edge: int, where: int, vertex: int) -> int:
 def _over(a: Vector, b: Vector, c: Vector, normal: Vector) -> float:
     """Return the squared distance [m^2] of a vertex from the plane of a triangle.
 
-    The distance is infinite unless the vertex is over the inside. Ericson 2005, 5.1.5.
+    It is infinite unless the vertex projects into the triangle. Ericson 2005, 5.1.5.
 
     a, b, c : from the vertex to the corners [m]
     """
@@ -137,7 +139,7 @@ def _over(a: Vector, b: Vector, c: Vector, normal: Vector) -> float:
 def _crossing(first: Vector, second: Vector, offset: Vector) -> tuple[float, float]:
     """Return the squared distance [m^2] of the lines of two edges, and |first x second|^2 [m^4].
 
-    The distance is infinite unless both nearest points are between the ends. Ericson 2005, 5.1.9.
+    The distance is infinite unless both nearest points lie within the edges. Ericson 2005, 5.1.9.
 
     offset : from the first edge's first end to the second edge's [m]
     """

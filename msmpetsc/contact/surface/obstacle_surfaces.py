@@ -20,8 +20,8 @@ LONGEST_EDGE = 4.0
 MOST_TRIANGLES = 10_000
 # Subdivisions of an icosahedron; it is then 5e-4 of its radius off the ball
 ROUND = 4
-# Distance from an obstacle beyond which nodes move on their own [cells, or longer
-# displacements]
+# Distance within which nodes move with an obstacle [cells]; farther off this fades out,
+# over as many displacements of the obstacle, or over as many cells if that is longer
 NEARBY = 4.0
 # Least distance of inverse distances [cells]
 TOUCHING = 1e-9
@@ -34,7 +34,8 @@ class ObstacleSurfaces:
     numbers   : (k,) of the obstacles in the scene
     obstacles : with their paths
     solids    : surfaces of the obstacles at time 0
-    straight  : times [s] between which points move straight, whatever their paths; None: never
+    straight  : times [s] between which points move along straight lines in place of their paths;
+                None: never
     """
 
     numbers: list[int]
@@ -92,8 +93,8 @@ class ObstacleSurfaces:
         """Return displacements (n, 3) [m] of nodes q (n, 3) between two times [s], with obstacles.
 
         Nodes at an obstacle move with it. Between obstacles displacements are interpolated by
-        inverse distances, so that a plate and a floor squeeze a body evenly. Farther off, nodes
-        change to ``moved`` (n, 3) [m].
+        inverse distances, so that a plate and a floor squeeze a body evenly. Farther off,
+        displacements fade to ``moved`` (n, 3) [m].
 
         distances : of each node from each obstacle (n, k) [m]
         """

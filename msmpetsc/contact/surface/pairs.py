@@ -34,7 +34,7 @@ FARTHEST = 0.05
 LEAST = 0.02
 # Moves of the last step that a broad phase allows for, if nothing touched
 AHEAD = 2.0
-# Share of points in contact from which a second solve costs more than narrow steps save
+# Share of points in contact beyond which second solves cost more than narrow steps save
 FEW = 0.01
 # Relative difference of two sums of contact energy by rounding
 SAME_ENERGY = 1e-9
@@ -46,8 +46,8 @@ class CollisionSurface:
     """Surface of bodies and obstacles in contact.
 
     surface      : of bodies without crossing triangles, then of obstacles; on rank 0, else None
-    points       : of the surface, by nodes
-    meets_itself : whether the surface meets itself, or obstacles alone
+    points       : W, from positions of nodes to points of the surface
+    meets_itself : whether the surface meets itself, too; if not, it meets obstacles alone
     parts        : name and number of points of each body and obstacle, on rank 0
     """
 
@@ -238,7 +238,7 @@ class ContactSearch:
 
         time        : of obstacles [s]; None for the end of the step
         with_points : compute the points even if nothing is near
-        base        : start of a path to q whose free share is computed next
+        base        : start of a path to q, whose collision-free step is computed next
         """
         q, time = q[: self.owned], self.time if time is None else time
         for moment in self._moments:

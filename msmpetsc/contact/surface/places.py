@@ -11,7 +11,7 @@ triangles, in a maximum spanning forest of these triangles. A link's b is at mos
 triangle. The energy is thus
 
 - at least the energy of the nearest triangle: never negative, and unbounded at distance 0;
-- continuous, because it is the minimum of smooth sums, one sum for each forest;
+- continuous, because it is the minimum over all forests of sums that are smooth;
 - the energy of the nearest triangle alone if v is over a flat or convex patch.
 
 An edge has the energy of its candidate edges likewise; its links are shared vertices. Links join

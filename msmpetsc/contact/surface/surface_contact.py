@@ -90,10 +90,10 @@ class SurfaceContact:
     All methods are collective. Positions are (owned or more, 3) [m].
 
     start        : positions at the start of the step
-    last         : positions one step before in a step of BDF2, whose friction goes by the end
-                   velocity
-    end          : end of an earlier solve of the step, whose normal forces are taken; None: the
-                   start's
+    last         : positions one step before ``start``, for BDF2, whose slip is the end velocity
+                   times tau
+    end          : end of an earlier solve of the step, whose normal forces set friction; None for
+                   the normal forces at the start
     before       : contact in the last step
     has_friction : whether there is friction
     friction     : of the step, on rank 0
@@ -135,7 +135,7 @@ class SurfaceContact:
         """Return friction with the normal forces of a moment, on rank 0.
 
         points       : (p, 3) at the start of the step [m]
-        came         : (p, 3) displacements in the last step, of a step of BDF2 [m]
+        came         : (p, 3) displacements in the last step [m], for BDF2; None otherwise
         extrapolates : extrapolate the normal forces, in a step of BDF2
         """
         contacts, barrier, stick = (
@@ -158,7 +158,7 @@ class SurfaceContact:
         return replace(friction, limit=np.clip(2 * friction.limit - before, 0, 2 * friction.limit))
 
     def friction_limits(self, q: Positions) -> Floats:
-        """Return the sum of mu N [N] that friction takes, and the sum at q, (2,), on rank 0."""
+        """Return the sum of mu N [N] that friction uses, and the sum at q, (2,), on rank 0."""
         moment, barrier = self.contacts.find(q), self.contacts.barrier
         if self.contacts.law.friction == 0 or not barrier:
             return np.zeros(2)

@@ -95,7 +95,7 @@ def friction_pairs(
 ) -> FrictionPairs:
     """Return the pushing pairs of some sets, their pushes reduced by links of negative weight.
 
-    The vertex or edge with the lesser first number is first, since ipctk has no order of its own.
+    Two vertices, or two edges, are ordered by their first points, since ipctk's order varies.
     """
     point, edge, face = np.arange(mesh.num_vertices)[:, None], mesh.edges, mesh.faces
     numbers, weights, push = [np.empty((0, 4), int)], [np.empty((0, 4))], [np.empty(0)]

@@ -59,7 +59,7 @@ class Holders:
 
     @classmethod
     def of_masks(cls, masks: dict[str, Mask], lattice: Lattice) -> "Holders":
-        """Return the holders of components (l, 3). A shared one is the first's (collective)."""
+        """Return the holders of components (l, 3); the first holds shared ones (collective)."""
         number = np.full((lattice.owned, 3), len(masks), np.int32)
         for holder, where in reversed([*enumerate(masks.values())]):
             number[where[: lattice.owned]] = holder
@@ -203,7 +203,7 @@ def _free_fraction(within: Within, start: Positions, end: Positions) -> Floats:
 def taken(
     comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor], masks: Regions
 ) -> tuple[str, ...]:
-    """Return descriptions of the nodes of anchors and forces, and warn of conflicts (collective).
+    """Return descriptions of rollers, anchors and forces, and warn of conflicts (collective).
 
     lattice : the lattice with its pins
     anchors : the anchors without nodes that a pin or an earlier anchor holds

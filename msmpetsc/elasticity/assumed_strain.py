@@ -23,12 +23,13 @@ does not. With <> the mean over the part inside the surface the energy is
     Q = <2 sum e_I^2 + beta (sum e_I)^2 + sum g_IJ^2>,     beta = 2 lambda / (lambda + 2 mu).
 
 beta is that of plane stress, so a plate of a single cell bends as it should at any Poisson's ratio.
-<|G|^2> is the mean square of the whole remainder of the gradient. Its share s holds corners of
-cells of which little is inside. XYZ is the square of the mode XYZ (lattice.cell_moments). The
-quartic term, with the side h of a cell and C = <d d^T>, counts in cells that are about to fold.
+<|G|^2> is the mean square of the whole remainder G of the gradient. With its small share s, corners
+of cells with little inside have some stiffness. XYZ is the square of the mode XYZ
+(lattice.cell_moments). The quartic term, with the side h of a cell and C = <d d^T>, counts in cells
+that are about to fold.
 
 - W is a sum of squares: it is never negative, also in folded cells, and 0 for rigid motions.
-- The quartic term is convex, and nothing at rest. The projected Hessian leaves it out.
+- The quartic term is convex, and its Hessian at rest is 0. The projected Hessian leaves it out.
 - At rest W is at most mu V <|G|^2> (1 + 3 beta / 2) if d_x, d_y and d_z are not correlated. The
   general bound is that of lattice.cell_moments.bounding_laplacians.
 - Q depends on C alone. Its form on the nine a (3 by axis, 3 by mode) is K.
@@ -37,9 +38,9 @@ With r_I = sum over m of (K a)_I,m p_m, the gradient of Q / 2 has the parts
 
     dQ/dp_m = sum over I of (K a)_I,m n_I,        dQ/df_I = c r_I - b (f_I . r_I) f_I           (5)
 
-with c = (1 + D) / (D + |f_I|^2) and b = 2 c^2 / (1 + D). The change of a direction with f_I by g is
-c g - b (f_I . g) f_I; its norm is at most c |g|. The projected Hessian keeps the directions: it is
-the form K of the changes n_I . dp. A Hessian's state therefore has p = 0 if it is projected.
+with c = (1 + D) / (D + |f_I|^2) and b = 2 c^2 / (1 + D). If f_I changes by g, its direction changes
+by c g - b (f_I . g) f_I, of a norm of at most c |g|. The projected Hessian keeps the directions: it
+is the form K of the changes n_I . dp. So the state of a projected Hessian needs no p.
 
 Lengths: the modes h of a strain are 2 h^2 p, h the side of a cell, and slopes are 4 h times F. So
 with the modes in a state divided by 4 h, all products are in units of slopes.
@@ -82,8 +83,8 @@ def _single(number: float) -> float:
 SQUARE = _single(0.5)
 # 1 + D [-]
 RANGE = _single(1.5)
-# 2 s / (1 - s) [-]; a wall of a tenth of a cell bends 15 to 20% too little. A power of
-# 2 is exact in single precision.
+# 2 s / (1 - s) [-]; with it a wall of a tenth of a cell bends 15 to 20% too little. A
+# power of 2 is exact in single precision.
 FULL = _single(1 / 256)
 # 1 - s [-], the factor of C in a cell's constants
 ASSUMED = 2 / (2 + float(FULL))
@@ -130,7 +131,7 @@ def directions(f: Three, c: Vector) -> Three:
 
 @njit(inline="always")
 def _lag(c: float) -> float:
-    """Return b of Eq. 5, by which a direction falls behind its column as it stretches."""
+    """Return b of Eq. 5, by which a direction grows less than its column does."""
     return c * (c + c) / RANGE
 
 

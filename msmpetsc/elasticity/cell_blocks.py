@@ -14,8 +14,9 @@ from msmpetsc.elasticity.springs import rows_of
 from msmpetsc.lattice.cell_moments import FORM
 from msmpetsc.lattice.lattice import Lattice
 
-# constants of a cell [-]: its form, with the modes' part times m = mu V / (16 h^2), and
-# C also times 1 - s (elasticity.assumed_strain); then m and lambda V / (16 h^2)
+# constants of a cell [-]: its form (lattice.cell_moments), whose entries for modes are
+# times m = mu V / (16 h^2) and, but for XYZ, times 1 - s (elasticity.assumed_strain);
+# then m and lambda V / (16 h^2)
 ROWS = FORM + 2
 # entries of a cell in a projected Hessian's state [-]: F by rows, then V U' and V U''
 # over 16 h^2

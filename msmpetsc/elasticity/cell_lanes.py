@@ -101,9 +101,7 @@ def _projected_product_lanes(w: Floats) -> None:
 def add_product(blocks: CellBlocks, state: Rows, v: Rows, product: Rows) -> None:
     """Add (Hessian) v [N] to ``product`` (l, 3), with the ``state`` of ``linearise``.
 
-    A projected Hessian has a narrow state.
-
-    All arrays have the same dtype.
+    The width of the state tells whether the Hessian is projected. All arrays have the same dtype.
     """
     w, projected = np.zeros(WORK, v.dtype), state.shape[1] == PROJECTED * LANES
     for b in range(len(blocks.nodes)):

@@ -95,7 +95,8 @@ class Elasticity:
         """Add a block diagonal D to the owned rows of ``blocks`` (l, 9) [N/m].
 
         The projected Hessian at q is at most ``bound`` D. A semidefinite form of n nodes is at most
-        n times its block diagonal: n = 2 for a spring, and 8 for a cell, where less is usual.
+        n times its block diagonal: n = 2 for a spring, and 8 for a cell, whose factor is usually
+        less.
         """
         for part in self.parts:
             part.add_bound(q, blocks)

@@ -19,17 +19,18 @@ within the cell (elasticity.assumed_strain). The volumetric energy u is
 - The second variation at rest is not negative, however the cell is cut. For a mean slope G
   it is ``2 mu |sym G|^2 + lambda (tr G)^2`` plus the squares of W.
 
-But for W the Hessian of a cell maps G to  V (mu G + U'' (cof F : G) cof F + U' F x G),  where
-F x G is the change of cof F. In the singular frame of F, with the singular values s, it splits
-into blocks:
+Without W the Hessian of a cell maps G to  V (mu G + U'' (cof F : G) cof F + U' F x G),  where
+F x G is the change of cof F by G. In the singular frame of F, with the singular values s, it
+splits into blocks:
 
 - 2 x 2 blocks [mu, -U' s_k; -U' s_k, mu];
 - a 3 x 3 block: sum (mu s_i^2 - U' J) y_i^2 + (U'' J^2 + U' J) (sum y_i)^2 with y_i = x_i / s_i.
   It is not negative if U' < 0, J >= 1/2 and U'' >= 0, for each u.
 
 For all other F the term of U' is at most |U'| R |F| in norm, with R^2 = 4/3. The reason is that
-the traceless matrix of s has the norm sqrt(2) |F|. The projected Hessian limits |U'| so that mu
-outweighs this term, and raises U'' to zero.
+its 3 x 3 block is symmetric and has no trace and, over U', the Frobenius norm sqrt(2) |F|. The
+projected Hessian limits |U'| so that mu outweighs this term, and raises negative U'' to zero. If
+U' < 0 and J >= J_0, the limit for the 2 x 2 blocks suffices for the 3 x 3 block, too.
 
 The loops of a CPU (elasticity.cell_lanes) and of a GPU (elasticity.cell_threads) share these
 formulas. A Hessian stores F, V U' and V U'' of each cell, and its modes unless it is projected.
@@ -66,13 +67,14 @@ VOLUMETRIC = ("quadratic", "log", "simo")
 QUADRATIC, LOG, SIMO = range(len(VOLUMETRIC))
 # J_0 [-]; U is a parabola below, so that the force on an inverted cell stays finite
 ONSET = 0.2
-# least J [-] at which compression keeps the 3 x 3 block semidefinite; see above
+# least J [-] from which U' < 0 keeps the 3 x 3 block of the true Hessian semidefinite;
+# see above
 CONVEX = 0.5
 # R, bound of the norm of G -> F x G by |F| [-]; see above
 NORM = math.sqrt(4 / 3)
 # iterations towards a cell's rotation [-]; Newton's method converges from any J > 0
 ROTATION_ITERATIONS = 30
-# change of a rotation at which its iteration ends [-]; close to rounding
+# norm of a step of this iteration at which it ends [-]; close to rounding
 ROTATION_TOLERANCE = 1e-12
 
 
@@ -134,11 +136,10 @@ def volume_change(j: float, before: float, change: float, mu: float, lame: float
 
 @njit(inline="always")
 def _coupling_bound(f: Three, j: float, slope: float, least: float) -> float:
-    """Return a bound c: the term of U' in the Hessian takes at most c |U'| from mu.
+    """Return a bound c: the term of U' lowers the eigenvalues of the Hessian by at most c |U'|.
 
-    Under compression (U' < 0) with J >= ``least`` the 3 x 3 block needs no bound. Then c is
-    Gershgorin's bound of the largest singular value of F, exact in a rotation. Otherwise c is R
-    |F|.
+    If U' < 0 and J >= ``least``, the 3 x 3 block needs no bound. Then c is Gershgorin's bound of
+    the largest singular value of F, exact in a rotation. Otherwise c is R |F|.
     """
     x, y, z = f
     xx, yy, zz = dot(x, x), dot(y, y), dot(z, z)
@@ -242,7 +243,7 @@ def projected_product(c: Floats, k: int, state: Floats, s: int, e: Strains) -> t
 def forms_change(
     c: Floats, k: int, d: Three, base: Strains, moved: Strains, inverse_h4: float
 ) -> float:
-    """Return the change of E but for U as F changes by d and the strains by ``moved``."""
+    """Return the change of E without U as F changes by d and the strains by ``moved``."""
     g, f = slopes_of(moved), gradient_of(base, inverse_h4)
     own: float = c[k + 104] * (inner(slopes_of(base), g) + 0.5 * inner(g, g))
     return own + rest_change(rest_constants(c, k), f, d, base, moved, inverse_h4)
@@ -307,7 +308,7 @@ def concavity_bounds(
 
 @njit(inline="always")
 def rotation_of(f: Three) -> tuple[Three, bool]:
-    """Return the rotation R of F = R S, and whether it was computed.
+    """Return the rotation R of the polar decomposition F = R S, and whether it was computed.
 
     Newton's iteration is R <- (R + R^-T) / 2 (Higham 1986). If J <= J_0, R is the identity.
     """

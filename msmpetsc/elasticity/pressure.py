@@ -1,9 +1,10 @@
 """Pressure p on surfaces that the lattice carries: a potential p V, and its derivatives.
 
 A triangle (a, b, c) has the force -p (b - a) x (c - a) / 6 at each corner: the uniform pressure on
-the linear triangle, at its present position. On a closed surface the forces are -p grad V, with V
-the volume to which the normals point away. So the resultant is zero, and the Hessian p grad grad V
-is symmetric. V is cubic along a straight way, so that Simpson's rule gives its change exactly.
+the linear triangle, at its present position. On a closed surface the forces are -p grad V. V is the
+volume that the surface bounds, positive if the normals point out of it. So the resultant is zero,
+and the Hessian p grad grad V is symmetric. V is cubic along a straight path, so that Simpson's rule
+for its derivative gives its change exactly.
 """
 
 from collections.abc import Iterator, Sequence

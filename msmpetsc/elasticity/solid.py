@@ -162,7 +162,7 @@ class CellHessians:
     def add_diagonal(self, diagonal: Rows) -> None:
         """Add the diagonal blocks of a projected Hessian to ``diagonal`` (l, 9) [N/m].
 
-        The term of U' has none.
+        The term of U' has no diagonal blocks.
         """
         cells = one_by_one(self.blocks, self.state)
         count = len(cells.nodes)

@@ -16,7 +16,8 @@ class Field(NamedTuple):
     """A dataset of a result file.
 
     dtype     : numpy name of the type written; a reader accepts any size of this kind
-    shape     : numbers and letters (msmpetsc/results/README.md); a letter has one value in a file
+    shape     : numbers and letters (scripts/docs/pages/reference/result-file.md); a letter has a
+                single value in a file
     unit      : "1" for a dimensionless quantity
     long_name : meaning in a few words
     at_rest   : name of the dataset with the values at rest, "" if there is none

@@ -1,7 +1,7 @@
 """The table of the options of a run.
 
 It defines the keywords of ``msmpetsc.run`` with their help, the options of ``msmpetsc run``, and
-the table of options in README.
+the table of options in the documentation (scripts/docs/pages/reference/command-line.md).
 """
 
 # ruff: noqa: RUF009

@@ -1,9 +1,9 @@
 """Compare two results frame by frame, without MPI and without PETSc.
 
 Results on the same lattice are compared in all fields. The error of a field is its largest
-difference at a frame, divided by the field's scale. The scale (results/README.md) is taken over
-both runs and all compared frames. Differences below the rounding of the coarser stored type are 0.
-Two NaN are equal, and so are two infinities of the same sign.
+difference at a frame, divided by the field's scale (scripts/docs/pages/how-to/compare.md). The
+scale is taken over both runs and all compared frames. Differences below the rounding of the coarser
+stored type are 0. Two NaN are equal, and so are two infinities of the same sign.
 
 Results on different lattices of the same mesh are compared in their surfaces, point by point.
 Both have the same points, so nothing is projected or interpolated. The weight of a point is a third

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 # a case by column; None for a value that was not measured
 Row = dict[str, Any]
-# scenes/studies/README.md gives units and meanings
+# scripts/docs/pages/reference/study-table.md gives units and meanings
 COLUMNS = (
     "study", "case", "scene", "map", "x", "y", "integrator", "preset", "options", "label",
     "ranks", "repeats", "time_step", "substep", "error", "max_iterations", "status", "reason",

@@ -1,4 +1,4 @@
-"""Bending and twist of a cell: the energy beside the mean deformation gradient.
+"""Energy of bending and twist within a cell, added to that of its mean deformation gradient.
 
 F is the mean deformation gradient of a cell, with the columns f_x, f_y and f_z. With the distance
 d = X - c from the centroid of the part inside the surface, positions in the cell are
@@ -22,7 +22,7 @@ does not. With <> the mean over the part inside the surface the energy is
     W = 1/2 mu V ((1 - s) (Q + kappa/8 tr C (h sum |p|^2)^2) + 2 s <|G|^2> + XYZ),              (4)
     Q = <2 sum e_I^2 + beta (sum e_I)^2 + sum g_IJ^2>,     beta = 2 lambda / (lambda + 2 mu).
 
-beta is that of plane stress, so a plate of a single cell bends as it should at any Poisson's ratio.
+beta is the value of plane stress, so a plate one cell thick bends correctly at any Poisson's ratio.
 <|G|^2> is the mean square of the whole remainder G of the gradient. With its small share s, corners
 of cells with little inside have some stiffness. XYZ is the square of the mode XYZ
 (lattice.cell_moments). The quartic term, with the side h of a cell and C = <d d^T>, counts in cells
@@ -31,7 +31,7 @@ that are about to fold.
 - W is a sum of squares: it is never negative, also in folded cells, and 0 for rigid motions.
 - The quartic term is convex, and its Hessian at rest is 0. The projected Hessian leaves it out.
 - At rest W is at most mu V <|G|^2> (1 + 3 beta / 2) if d_x, d_y and d_z are not correlated. The
-  general bound is that of lattice.cell_moments.bounding_laplacians.
+  general bound is in lattice.cell_moments.bounding_laplacians.
 - Q depends on C alone. Its form on the nine a (3 by axis, 3 by mode) is K.
 
 With r_I = sum over m of (K a)_I,m p_m, the gradient of Q / 2 has the parts
@@ -88,8 +88,8 @@ RANGE = _single(1.5)
 FULL = _single(1 / 256)
 # 1 - s [-], the factor of C in a cell's constants
 ASSUMED = 2 / (2 + float(FULL))
-# kappa [-] of Eq. 4; bars let go twisted by 720 degrees then come back, and a cell bent
-# to strains of 0.1 is stiffer by 1.5%
+# kappa [-] of Eq. 4; with it bars twisted by 720 degrees untwist when let go, and a
+# cell bent to strains of 0.1 is stiffer by 1.5%
 HARDENING = _single(2.0)
 # keeps divisors from zero [-]
 LEAST = _single(1e-30)

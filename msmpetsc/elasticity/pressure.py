@@ -91,7 +91,8 @@ class PressureHessian:
     def triangles(self) -> Iterator[tuple[SurfacePart, Rows]]:
         """Yield each surface with the symmetric part (f, 9, 9) [N/m] of each triangle's matrix.
 
-        Rows go by corner, then x, y and z. The other parts cancel over the triangles.
+        Rows are ordered by corner, then by x, y and z. The antisymmetric parts cancel in the sum
+        over the triangles.
         """
         unit = np.eye(9).reshape(9, 3, 1, 3).swapaxes(0, 1)
         for part, pressure, corners in self.acting:

@@ -1,6 +1,6 @@
 """Stress of a neo-Hookean solid, in each cell and at each node.
 
-F is the mean deformation gradient of a cell, J = det F, and U is that of elasticity.neo_hookean.
+F is the mean deformation gradient of a cell, J = det F, and U is defined in elasticity.neo_hookean.
 The first Piola-Kirchhoff and the Cauchy stress are (Bonet and Wood 2008, chapter 5)
 
     P = mu F + U' cof F,        sigma = P F^T / J = mu / J F F^T + U' I.

@@ -71,10 +71,10 @@ class BarrierLaw:
     ) -> "BarrierLaw":
         """Return the law of a lattice in steps of ``time_step`` [s] (collective).
 
-        kappa / dhat^2 is a stiffness per area: that of a layer of full cells, E / h, plus the share
-        of its inertia in a step, rho h / t^2. Ando (2024, A cubic barrier with elasticity-inclusive
-        dynamic stiffness) takes both of each contact. Here both are of the stiffest cell, so that
-        the energy of a state never changes.
+        kappa / dhat^2 is a stiffness per area: the stiffness E / h of a layer of full cells, plus
+        its inertia in a step, rho h / t^2. Ando (2024, A cubic barrier with elasticity-inclusive
+        dynamic stiffness) computes both for each contact. Here they are of the stiffest cell and
+        the heaviest node, so that the energy of a state never changes.
 
         distance : dhat [m]
         side     : longest side of the smallest body [m]

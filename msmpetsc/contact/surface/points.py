@@ -65,8 +65,8 @@ class SurfacePoints:
     def distances(self, q: Positions, time: float) -> Rows:
         """Return the least distance (owned, k) [m] from each obstacle of the points of each node.
 
-        A node without points has its own distance. A light node may swing far out of its surface,
-        so its points stand for it.
+        A node without points has its own distance. The points of other nodes count, since a light
+        node may swing far out of its surface.
         """
         points = self(q, time)[: self.bodies]
         of_points = self.comm.bcast(self.obstacles.distances(points, time) if len(points) else None)

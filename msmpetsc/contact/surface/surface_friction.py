@@ -1,6 +1,6 @@
-"""Friction between parts of surfaces in one step, by the law of contact.obstacles.node_friction.
+"""Friction between parts of surfaces in one step, by the law of contact.friction.
 
-Points of contact, normal and normal force of a pair are those of one moment (Li et al. 2020,
+The contact points, normal and normal force of a pair are fixed in a solve (Li et al. 2020,
 Incremental Potential Contact, section 5.3). So the slip of a pair is linear in the points.
 """
 

@@ -93,7 +93,7 @@ class Measure:
 
 
 class StepControl:
-    """Choose the levels of steps and keep the error account of a run, alike on all ranks.
+    """Choose the levels of steps and keep the error account of a run, equally on all ranks.
 
     A step of a level is 2^level times as long as the scene's step.
 
@@ -142,7 +142,7 @@ class StepControl:
         return False
 
     def shorten(self, level: int, by: int = 1) -> bool:
-        """Lower the level below that of a failed step; return whether a lower level exists."""
+        """Lower the level below the level of a failed step; return whether a lower level exists."""
         self.level, self.calm = max(self.lowest, level - by), 0
         return level > self.lowest
 

@@ -34,8 +34,8 @@ from msmpetsc.solve.petsc.events import CONTACT
 from msmpetsc.solve.presets import find_preset
 from msmpetsc.solve.work import Work
 
-# most solves of a step to settle its contact faces; with others nodes may pass through
-# a thin obstacle
+# most solves of a step until its contact faces are right; wrong faces let nodes pass
+# through a thin obstacle
 MOST_SOLVES = 10
 # energy of surface pairs that may be left out, over the energy tolerance of the step; x
 # then moves by 0.01 of the error

@@ -62,7 +62,8 @@ HALVINGS = 5
 MOST_SUBSTEPS = 1e6
 # spurious energy that rounding may cause, over the least energy of an unstable body
 ROUNDING = 1e-14
-# elastic energy of an unstable body, over that of crushed springs; no load reaches it
+# elastic energy of an unstable body, over the energy of crushed springs; no load
+# reaches it
 UNSTABLE = 100.0
 
 

@@ -11,7 +11,7 @@ LEAST_PIVOT = 1e-300
 class BlockCholesky:
     """Solve with a matrix by its Cholesky factor in blocks (a context of PCPYTHON).
 
-    The blocks are those of the matrix: 3 x 3 on a lattice, single numbers in GAMG of A.
+    The matrix gives the block size: 3 on a lattice, 1 in GAMG of A.
     Blocks take 0.4 of the time of PETSc's factor of an AIJ, whose symbolic factorisation takes
     longer than the numeric one. PETSc factors blocks in their given order, so they are permuted by
     ``order`` (n,) first. Every PETSc has qmd, the common ordering with the least fill.

@@ -150,7 +150,7 @@ def _distinct_cells(owners: SortedKeys, first: Indices, copies: Indices) -> Indi
 
 
 def in_cells(low: Indices, ijk: Indices, parents: Array) -> Array:
-    """Return the copies (n, 8) of the corners of coarse cells, from those of fine nodes in them.
+    """Return the copies (n, 8) of the corners of coarse cells, from parents of fine nodes in them.
 
     low     : (n, 3) index of the coarse cells
     ijk     : (n, k, 3) index of fine nodes in each cell

@@ -135,9 +135,9 @@ class LowestCurvature:
             return -np.inf, self.search.random(1)[0]
         self.mode, self.value = modes[0].copy(), float(values[0])
         if values[0] < 0:
-            # A body may buckle to several sides alike. The projection of noise on these
-            # modes does not depend on their order, which is rounding's, so all ranks
-            # take one side.
+            # A body may buckle equally to several sides; rounding orders these modes.
+            # The projection of noise on them does not depend on their order, so any
+            # number of ranks takes the same side.
             down = modes[: int((values <= ALIKE * values[0]).sum())]
             noise = self.search.random(1)[0]
             parts = self.comm.allreduce(to_host((down * self.functional.mass) @ noise))

@@ -1,6 +1,6 @@
 """Stopping rule of a step: the error of an iterate x, and the tolerance of the next linear solve.
 
-The relative error of x is |x - x*|_M / |x - y|_M. Two numbers stand for the error:
+The relative error of x is |x - x*|_M / |x - y|_M. It is bounded, then estimated:
 
 1. |F(x)|_(M^-1) is an upper bound if E is convex between x and x*.
 2. The Newton correction at x is the error up to terms of second order (error_estimate). Newton's

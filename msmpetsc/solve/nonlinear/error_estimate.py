@@ -8,10 +8,10 @@ found e_k. The missing part of e is bounded in two ways,
 
 with r_k = F - H e_k, if no eigenvalue of M^(-1) H is below lambda and none of P^(-1) H below kappa.
 The first bound is safe, but too high by up to a thousand on stiff bodies. The second is close, but
-too low if CG has not met the least eigenvalue, since kappa is its least Ritz value. It is at most
-1, the mean of the eigenvalues if P is the diagonal of H. The geometric mean of both stands for the
-missing part in Newton's own solves (CorrectionTest). With contact, and in a solve for the estimate
-alone (ErrorEstimate), it is the first bound.
+too low if CG has not met the least eigenvalue, since kappa is its least Ritz value. kappa is at
+most 1, the mean of the eigenvalues if P is the diagonal of H. In Newton's own solves
+(CorrectionTest) the missing part counts as the geometric mean of both bounds. With contact, and in
+a solve for the estimate alone (ErrorEstimate), it counts as the first bound.
 
 A solve for the estimate alone ends if
 

@@ -152,7 +152,7 @@ class Jacobian:
 class FrictionDuals:
     """Dual unknowns of Newton's method: forces of friction over their limits.
 
-    See contact.obstacles.node_friction.
+    See contact.friction.
 
     contact : of the step in progress; None without any
     duals   : of the next Hessian; None without contact. A step begins with zeros, the secants, for

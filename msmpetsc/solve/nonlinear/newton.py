@@ -89,7 +89,7 @@ class Newton(StepMethod):
             self.test.begin_step(self.functional.problem.contact is not None)
 
     def _create_test(self) -> CorrectionTest | None:
-        """Return the test of CG that also tells the error of x; None for other linear solves."""
+        """Return the test of CG that also tests the error of x; None for other linear solves."""
         is_cg = self.ksp.getType() == PETSc.KSP.Type.CG
         is_natural = self.ksp.getNormType() == PETSc.KSP.NormType.NATURAL
         of_user = any(map(self.options.is_given, TESTS))
@@ -168,7 +168,7 @@ class Newton(StepMethod):
         return self.test is not None and not projected and self.slopes is None
 
     def _tells_error(self, now: Iterate, outcome: Outcome, projected: int) -> bool:
-        """Return whether the next linear solve tells the error.
+        """Return whether the next linear solve tests the error of x.
 
         With contact it does so only near the goal. Farther away, duals replace the true curvature
         of friction.
@@ -190,7 +190,7 @@ class Newton(StepMethod):
             self.slopes = None
 
     def _solve(self, now: Iterate, outcome: Outcome, tells_error: bool) -> Outcome:
-        """Solve H y = F; return the outcome with what the solve tells of the iterate.
+        """Solve H y = F; return the outcome, with the error of x if the solve has measured it.
 
         tells_error : whether the solve may end as soon as it shows that the error is acceptable
         """
@@ -268,8 +268,8 @@ class Newton(StepMethod):
     def _stop_at_obstacles(self, now: Iterate, contact: StepContactAt, end: Positions) -> Positions:
         """Bend y so that nodes stop at obstacles that they would enter.
 
-        H at x does not know obstacles that nodes do not touch yet. A line search that shortened the
-        whole step for each of them would let them come in one by one. A direction that hardly
+        H at x lacks obstacles that nodes do not touch yet. If the line search shortened the whole
+        step for such nodes, they would come into contact one by one. A direction that hardly
         descends when bent stays as it is.
 
         end : positions (l, 3) [m] at x - y

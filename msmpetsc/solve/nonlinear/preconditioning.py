@@ -25,8 +25,8 @@ MULTIGRID = PETSc.PC.Type.MG
 DIRECT = {PETSc.PC.Type.CHOLESKY, PETSc.PC.Type.LU}
 # Greatest t^2 k / m of a node; beyond it multigrid takes less time than Jacobi's
 STIFF = 15.0
-# t^2 k / m beyond which rounding hides the mass, which alone tells where a free body
-# moves
+# t^2 k / m beyond which rounding hides M in H; only M resists translations of a free
+# body
 MASSLESS = 1e9
 # Iterations per digit with a hierarchy of the present positions
 USUAL_RATE = 2.5

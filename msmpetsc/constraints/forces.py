@@ -152,6 +152,8 @@ class ActingForces:
 
         q, v : positions (l, 3) [m] and velocities (l, 3) [m/s]
         time : begin of the step [s]
+
+        Raises InputError if the result of a function has a wrong shape or is not finite.
         """
         owned = self.lattice.owned
         for number, force in enumerate(self.own_forces):

@@ -125,7 +125,10 @@ def obstacle_surface(mesh: MeshTable, key: str, folder: Path) -> Surface:
 
 
 def _solid(comm: MPI.Comm, table: ObstacleTable, key: str, folder: Path, nodes: Positions) -> Solid:
-    """Return the solid of a table. A function is checked at the nodes (owned, 3) [m] at rest."""
+    """Return the solid of a table. A function is checked at the nodes (owned, 3) [m] at rest.
+
+    Raises InputError if a mesh is not closed or a function is no signed distance.
+    """
     if table.mesh is not None:
         mesh = table.mesh
         surface = comm.bcast(on_root(comm, lambda: obstacle_surface(mesh, key, folder)))

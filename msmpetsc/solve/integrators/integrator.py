@@ -118,7 +118,7 @@ class Integrator(Protocol):
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         """Take the step that ends at ``time`` [s]; return its result and the state after it.
 
-        Raises StepFailed.
+        Raises StepFailed, StepStopped after a signal, and InputError (Stepper.step).
         """
 
     def save(self, checkpoint: Checkpoint) -> None:

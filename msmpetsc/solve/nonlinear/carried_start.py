@@ -55,7 +55,8 @@ class CarriedStart:
 
         drift : returns the mean displacement of a free body from displacements (l, 3) [m]
 
-        Raises StepFailed if anchors and obstacles cannot reach their places.
+        Raises StepFailed if anchors and obstacles cannot reach their places; StepStopped after a
+        signal.
         """
         functional, problem = self.functional, self.functional.problem
         contacts = functional.surface.contacts if functional.surface else None
@@ -109,7 +110,7 @@ class CarriedStart:
         return float(max(fixed, greatest(np.abs(obstacles)), contacts.law.distance))
 
     def _carry(self, contacts: ContactSearch, end: float) -> Positions:
-        """Return the start at s = 1 by Newton's directions. Raises StepFailed."""
+        """Return the start at s = 1 by Newton's directions. Raises StepFailed and StepStopped."""
         functional, problem, begin = self.functional, self.functional.problem, contacts.begin
         is_fixed, still = functional.lattice.fixed, np.zeros((1, 3))
         q, s, gained = problem.q, 0.0, 1.0
@@ -144,6 +145,8 @@ class CarriedStart:
         """Return Newton's direction (l, 3) [m] at q (l, 3) [m], fixed nodes included.
 
         fixed, obstacles : displacements of fixed nodes (l, 3) and obstacles' points (o, 3) [m]
+
+        Raises StepStopped after a signal.
         """
         functional, unknowns = self.functional, self.functional.unknowns
         x, change, f = (functional.vectors.take() for _ in range(3))

@@ -283,7 +283,7 @@ class Rounding:
         self.moved, self.size = float(ROUNDINGS * np.sqrt(stiffness)), float(np.sqrt(mass))
 
     def refuse_loads(self) -> None:
-        """Raise InputError for loads that move a node so far that its shape has no digits left."""
+        """Raise InputError for loads that move a node so far that the shape has no digits left."""
         functional = self.functional
         load = np.sqrt((functional.problem.load[functional.unknowns.free] ** 2).sum(axis=1))
         local = np.array([greatest(load), functional.t2 * greatest(load / self.diagonal)])

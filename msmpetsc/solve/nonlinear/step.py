@@ -221,8 +221,8 @@ class Stepper:
 
         start : first guess (l, 3) [m]; None for the best of several
 
-        Raises StepFailed on all ranks, StepStopped after a signal, and InputError if PETSc's
-        options contradict each other.
+        Raises StepFailed on all ranks, and StepStopped after a signal. Raises InputError if PETSc's
+        options contradict each other, or if loads are too great (Rounding.refuse_loads).
         """
         with petsc_errors("PETSc cannot take a step with these options", self):
             self.before = self.work_so_far()
@@ -259,7 +259,7 @@ class Stepper:
 
         If the first iteration of a static state overshoots, minimise with smaller lambdas first.
 
-        Raises StepFailed and InputError.
+        Raises StepFailed, StepStopped and InputError.
         """
         newton = self.method
         if not (
@@ -285,7 +285,7 @@ class Stepper:
         change little. The first Hessian of each solve keeps the slopes V U' of the last solution,
         since its own lambda would make them far too large.
 
-        Raises StepFailed.
+        Raises StepFailed and StepStopped.
         """
         solid = self.functional.elasticity.solid
         ratio = 1.0

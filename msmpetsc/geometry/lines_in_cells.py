@@ -126,7 +126,7 @@ def split_cell(
 
     triangles : (t, 3, 3) in the cell, from its low corner
     piece     : (t,) piece of each triangle
-    flush     : (t,) bits of ``_flush``
+    flush     : (t,) bits of ``cell_parts._flush``
     part      : (k,) part of each piece, set here; -1 for a flush piece that no line meets
     faces     : (6, LINES^2) part at each line of each face, set here
     sums      : (COPIES, 11) integrals of the corners' functions (8) and second moments (3) over

@@ -147,7 +147,7 @@ def _turned(search: Lobpcg, squares: Floats, modes: Rows) -> Rows:
 
 
 def time_of_sound(lattice: Lattice) -> float:
-    """Return the time [s] of sound along the longest side, of the speed (E / density)^(1/2)."""
+    """Return the travel time [s] of sound, of speed sqrt(E / density), along the longest side."""
     stiffness = float(lattice.cell_stiffness[: lattice.cells_owned].sum())
     mass, edges = lattice.table.comm.allreduce(np.array([float(lattice.mass.sum()), stiffness]))
     # An edge has the stiffness 4/7 E h (lattice.material)

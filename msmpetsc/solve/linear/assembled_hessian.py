@@ -1,8 +1,8 @@
 """The Hessian of a step as a PETSc matrix, for solvers that need one.
 
 A row of the matrix belongs to a coordinate of a free node: x, y and z of a node in sequence. Rows
-and columns of fixed components are zero, but for their own diagonals. Products with all other
-operators need no matrix (solve.linear.operators).
+and columns of fixed components are zero except for their diagonals. Solvers of this package need no
+matrix (solve.linear.operators).
 """
 
 from collections.abc import Iterator

@@ -70,7 +70,7 @@ class ContactBlocks:
 
 
 class ThreeColumns:
-    """Apply A (x) I_3, plus contact, without assembling it; no penalty: ``contact`` is None."""
+    """Apply A (x) I_3 plus contact without assembling it; ``contact`` is None without contact."""
 
     def __init__(self, matrix: PETSc.Mat, unknowns: Unknowns, contact: ContactBlocks | None = None):
         self.matrix, self.contact = matrix, contact
@@ -91,7 +91,7 @@ class ThreeColumns:
 
 
 class TrueHessian:
-    """Apply the true Hessian H = M + t^2 (Hessian of E and of contact) spring by spring.
+    """Apply the true Hessian H = M + t^2 (Hessian of E and of contact), by springs or by cells.
 
     products : number of products so far
     product  : memory (l, 3) for the forces of a product
@@ -127,10 +127,10 @@ class TrueHessian:
     ) -> None:
         """Linearise about positions q (l, 3) [m], with the contact there.
 
-        projected : project out the negative curvature of each spring (elasticity.springs)
+        projected : leave out the negative parts of springs, cells and contact pairs
         duals     : duals of friction, which replace its true curvature (contact.friction)
         """
-        # The old Hessian goes before the new one comes
+        # Free the memory of the old Hessian before the new one takes its own
         self.at, self.elastic = (q, projected), None
         with HESSIAN:
             self.elastic = self.elasticity.hessian_at(q, projected)

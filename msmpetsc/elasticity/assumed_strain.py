@@ -1,4 +1,4 @@
-"""Energy of bending and twist within a cell, added to that of its mean deformation gradient.
+"""Energy of bending and twist in a cell, beside the energy of its mean deformation gradient.
 
 F is the mean deformation gradient of a cell, with the columns f_x, f_y and f_z. With the distance
 d = X - c from the centroid of the part inside the surface, positions in the cell are

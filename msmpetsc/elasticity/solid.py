@@ -75,7 +75,8 @@ def concavity_constants(constants: Rows) -> Rows:
     least, greatest = spectrum[:, :1].clip(0), spectrum[:, 2:]
     columns = _shares(slopes), _shares(modes[:, :3]), least, greatest
     rows = np.concatenate(columns, axis=1).astype(np.float32).reshape(-1, LANES, BOUNDS)
-    return rows.swapaxes(1, 2).reshape(-1, BOUNDS * LANES)
+    interleaved: Rows = rows.swapaxes(1, 2).reshape(-1, BOUNDS * LANES)
+    return interleaved
 
 
 def _shares(operators: Rows) -> Rows:
@@ -87,8 +88,9 @@ def _shares(operators: Rows) -> Rows:
     """
     lengths = np.linalg.norm(operators, axis=1)
     weighted = operators / np.maximum(lengths, np.finfo(float).tiny)[:, None]
-    norms: Rows = np.linalg.eigvalsh(weighted @ operators.swapaxes(1, 2))[:, -1:]
-    return lengths * norms
+    norms = np.linalg.eigvalsh(weighted @ operators.swapaxes(1, 2))[:, -1:]
+    shares: Rows = lengths * norms
+    return shares
 
 
 @kernel

@@ -224,9 +224,9 @@ def _off(bodies: list[Surface], coarser: list[Surface], distance: float) -> floa
     off = np.sqrt(np.concatenate(squares))
     if off.max() > distance:
         log.warning(
-            "self_contact.surface: the surface drawn is off the surface of %d triangles that meets "
-            "itself by up to %.2g m, half of it by more than %.2g m: where it touches, it may "
-            "cross by as much; more triangles bring it nearer",
+            "self_contact.surface: the contact surface of %d triangles is up to %.2g m off the "
+            "drawn surface, half of it by more than %.2g m: drawn surfaces may cross by as much; "
+            "more triangles bring it nearer",
             sum(len(coarse.triangles) for coarse in coarser),
             off.max(),
             np.median(off),

@@ -68,8 +68,8 @@ class Jacobian:
         kind = options.value("pc_type")
         if kind == MULTIGRID and not true_hessian:
             raise InputError(
-                f"-{options.prefix}pc_type mg is of the Hessian, for newton's presets; "
-                "of A there is gamg"
+                f"-{options.prefix}pc_type mg needs the Hessian, which newton's presets have; "
+                "gamg does for A"
             )
         context = (
             self.hessian if true_hessian else ThreeColumns(self.matrix, self.unknowns, self.blocks)

@@ -33,7 +33,7 @@ from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 ALIKE = 0.9
 # Growth of the compression, or of the mode's curvature, beyond which another mode may
 # be the lowest
-MORE = 1.25
+MORE = 1.5
 # Relative change of the mode's curvature below which the mode is taken as it is
 UNCHANGED = 0.1
 

@@ -5,14 +5,28 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from block_scene import DENSITY, GRAVITY, SIDES, G, block_scene, box_at, play, solid_of
+from block_scene import (
+    DENSITY,
+    GRAVITY,
+    SIDES,
+    G,
+    block_scene,
+    box_at,
+    model_of,
+    play,
+    solid_of,
+)
 from crossings import count_crossings, crossings
+from mpi4py import MPI
 from one_process import input_error
+from scipy.spatial.transform import Rotation
 from test_contact import PRESSED, off_the_slide
 
 from msmpetsc.build import Model
 from msmpetsc.contact.step_contact import StepContactAt
 from msmpetsc.contact.surface.obstacle_surfaces import ObstacleSurfaces
+from msmpetsc.contact.surface.pairs import CandidateCache, ContactSearch
+from msmpetsc.contact.surface.surface_contact import SurfaceContact
 from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.nonlinear.preconditioning import LatticePreconditioner
@@ -169,6 +183,25 @@ def test_a_ball_pressed_into_a_hole_stays_on_its_rim(
     ring = trimesh.load(tmp_path / "washer.ply").apply_translation([0, 0, -0.0305])
     assert (crossings(model, frames, ring) == 0) == (response == "barrier")
     assert 0.25 * pull < frames[-1].push[0, 2] < 3 * pull
+
+
+def test_a_block_that_turns_with_a_table_slips_by_nothing_in_a_step_of_bdf2(tmp_path: Path):
+    """With the table's velocity of the middle of the step, blocks crept out by w^2 r t / 2."""
+    t = 0.01
+    table = box_at([[-1, -1, -0.2], [1, 1, -2e-4]], response="barrier", center=[0, 0, 0])
+    table["path"] = [{"time": 1.0, "turn": [0, 0, 360]}]
+    rough = {"distance": 1e-3, "friction": 0.5}
+    time = {"step": t, "duration": 1.0, "integrator": "bdf2"}
+    model = model_of(fine_block(tmp_path, time=time, self_contact=rough, obstacle=[table]))
+
+    def turned(time: float) -> np.ndarray:
+        return Rotation.from_rotvec([0, 0, 2 * np.pi * time]).apply(model.lattice.nodes)
+
+    contacts = ContactSearch(CandidateCache(MPI.COMM_SELF, model.collision), t, 2 * t)
+    friction = SurfaceContact(contacts, turned(t), t, turned(0)).friction
+    assert friction is not None and len(friction.pairs) > 10
+    slip = friction.slip(contacts.points_at(turned(2 * t), 2 * t))[0]
+    np.testing.assert_allclose(slip, 0, atol=1e-14)
 
 
 def error_of_a_slide(folder: Path, t: float) -> float:

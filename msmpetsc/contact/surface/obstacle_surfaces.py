@@ -77,6 +77,18 @@ class ObstacleSurfaces:
             else np.zeros((1, 3))
         )
 
+    def displacements_before(self, begin: float, end: float) -> Rows:
+        """Return displacements (o, 3) [m] in a step before ``begin``, of the rates of a step.
+
+        Paths go back from begin as straight as they go to end [s]: a kink at begin does not count.
+        """
+        at_begin, before = [], []
+        for path, solid in zip((o.path for o in self.obstacles), self.solids, strict=True):
+            pose = path.value_at(begin)
+            at_begin.append(path.moved(solid.points, pose))
+            before.append(path.moved(solid.points, 2 * pose - path.value_at(end)))
+        return np.concatenate(at_begin) - np.concatenate(before)
+
     def sums(self, forces: Rows) -> Rows:
         """Return the total force (k, 3) [N] on each obstacle, by forces (o, 3) [N] on points."""
         owner = np.repeat(np.arange(len(self.solids)), [len(solid.points) for solid in self.solids])

@@ -147,8 +147,10 @@ class SurfaceContact:
             return None
         if came is None:
             return barrier.friction(moment.contacts, moment.points, points, stick)
-        moved = contacts.obstacles.displacements(contacts.begin, contacts.time)
-        came[contacts.points.bodies :] = moved
+        if contacts.obstacles.total:
+            came[contacts.points.bodies :] = contacts.obstacles.displacements_before(
+                contacts.begin, contacts.time
+            )
         friction = barrier.friction(
             moment.contacts, moment.points, points + came / 3, 2 / 3 * stick
         )

@@ -175,9 +175,10 @@ class EnergyBalance:
             frame = sums[5:8] / (pressing * time_step)
         else:
             frame = np.where(is_fixed, 0.0, momentum / mass)
-        start, _, work, struck, _ = self._start(before, result, after, time, time_step, frame)
+        # Impacts follow the solve: the next step starts with their energy.
+        start, _, work, _, _ = self._start(before, result, after, time, time_step, frame)
         ended = self.energies.inner - momentum @ frame + 0.5 * mass * frame @ frame
-        gained = ended - start - work - struck
+        gained = ended - start - work
         return bool(gained > NOTABLE_GAIN * max(start + max(work, 0.0), self.floor))
 
     def _budget_after(

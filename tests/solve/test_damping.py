@@ -122,6 +122,21 @@ def test_viscosity_does_not_brake_a_spin(tmp_path: Path):
     assert (np.diff([frame.elastic for frame in frames[2:]]) > 0).all()
 
 
+@pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
+def test_a_body_that_an_anchor_leads_as_it_flies_is_not_strained(tmp_path: Path, integrator: str):
+    """Led nodes of BDF2's first step had 1.9 times the velocity of their path."""
+    start = {"start": {"velocity": SPEED}}
+    path = [{"time": 1.0, "by": SPEED}]
+    led = {"anchor": [{"region": {"box": [[-1, -1, -1], [0.01, 1, 1]]}, "path": path}]}
+    scene = viscous(tmp_path, integrator, STEP, 3 * STEP, RETARDATION, **start, **led)
+    model, frames = play(scene)
+    for frame in frames:
+        moved = frame.position - model.lattice.nodes - np.array(SPEED) * frame.time
+        np.testing.assert_allclose(moved, 0, atol=1e-9)
+    for frame in frames[1:]:
+        np.testing.assert_allclose(frame.momentum, np.array(SPEED) * model.lattice.mass.sum())
+
+
 @pytest.mark.parametrize("integrator", ["verlet", "static"])
 def test_viscosity_is_of_implicit_steps(tmp_path: Path, integrator: str):
     with pytest.raises(InputError, match=r"retardation_time"):

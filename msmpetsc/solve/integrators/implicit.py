@@ -354,7 +354,7 @@ class Bdf2(ImplicitEuler):
         load = forces.mean(begin, time)
         history, begun_error = state.history, 0.0
         if history is None:
-            history, begun_error, work_before = self._history(state, load, time)
+            history, v, begun_error, work_before = self._history(state, load, time)
         else:
             load = forces.ahead(begin - (state.span or self.time_step), begin, time)
         q_0, v_0 = history
@@ -382,8 +382,10 @@ class Bdf2(ImplicitEuler):
 
     def _history(
         self, state: State, load: ExternalForces, time: float
-    ) -> tuple[tuple[Positions, Rows], float, Work]:
-        """Return a history for a state without history, its error, and the work of finding it.
+    ) -> tuple[tuple[Positions, Rows], Rows, float, Work]:
+        """Return a history for a state without history, the velocities, the error, and the work.
+
+        Held components have the velocity of their path from now on, and no acceleration.
 
         The history leads to q and v with the acceleration a of an implicit Euler step of length
         tau. The error of this acceleration is of first order.
@@ -395,9 +397,11 @@ class Bdf2(ImplicitEuler):
         t, tau, q, v = self.time_step, self.tau, state.q, state.velocity(self.time_step)
         y = q + carried_time(tau, self.damping) * v
         result, _ = self._solve(state, y, load, time - t + tau, tau)
-        a = ((result.position - q) / tau - v) / tau
+        v_end = (result.position - q) / tau
+        v = np.where(self.stepper.lattice.fixed, v_end, v)
+        a = (v_end - v) / tau
         history = q - t * v + t**2 / 2 * a, v - t * a
-        return history, self._begun_error(result), result.cost
+        return history, v, self._begun_error(result), result.cost
 
     def _begun_error(self, result: StepResult) -> float:
         """Return the error [m sqrt(kg)] of the history that ``_history`` makes of this result."""

@@ -89,7 +89,7 @@ def blocks_of(lattice: Lattice, constants: Rows, u: int) -> CellBlocks:
     cells = to_host(lattice.local_cells)[:, BY_AXIS]
     number = np.arange(len(constants))
     kinds = []
-    _, alike, count = np.unique(_whole_rows(constants), return_inverse=True, return_counts=True)
+    _, alike, count = np.unique(whole_rows(constants), return_inverse=True, return_counts=True)
     # Cells with constants too rare to fill a block keep their order, for locality.
     rank = np.where(count[alike] < LANES, len(count), alike)
     for kind in (number < lattice.cells_owned, number >= lattice.cells_owned):
@@ -97,7 +97,7 @@ def blocks_of(lattice: Lattice, constants: Rows, u: int) -> CellBlocks:
         order = own[np.argsort(rank[own], kind="stable")]
         kinds.append(_in_blocks(cells[order], constants[order]))
     nodes, rows = (np.concatenate(parts) for parts in zip(*kinds, strict=True))
-    _, first, which = np.unique(_whole_rows(rows), return_index=True, return_inverse=True)
+    _, first, which = np.unique(whole_rows(rows), return_index=True, return_inverse=True)
     around = np.empty((8, 0), np.int64)
     if not on_host(lattice.nodes):
         # Cells that only fill up a block have no stiffness. Their corners get no row.
@@ -120,7 +120,7 @@ def _in_blocks(nodes: Indices, constants: Rows) -> tuple[Indices, Rows]:
     return nodes.reshape(-1, LANES, 8), rows.transpose(0, 2, 1).reshape(-1, ROWS * LANES)
 
 
-def _whole_rows(rows: Rows) -> Array:
+def whole_rows(rows: Rows) -> Array:
     """Return each row as a single item (n,), which sorts and compares bit by bit."""
     return (
         np.ascontiguousarray(rows).view(np.dtype((np.void, rows.itemsize * rows.shape[1]))).ravel()

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import Floats, Positions, Rows, to_host
-from msmpetsc.elasticity.cell_blocks import STATE
+from msmpetsc.elasticity.cell_blocks import BY_AXIS, STATE, whole_rows
 from msmpetsc.elasticity.cell_strain import LANES
 from msmpetsc.elasticity.cell_threads import cell_changes
 from msmpetsc.elasticity.neo_hookean import ONSET
@@ -41,8 +41,12 @@ class StressField:
         self.rest = lattice.nodes
         corners, of_blocks = to_host(lattice.local_cells), to_host(solid.blocks.nodes)
         # The first occurrence of a cell comes before the copies that fill up a block.
-        first, lanes = np.unique(of_blocks[:, :, 0], return_index=True)
-        self.lanes = lanes[np.searchsorted(first, corners[:, 0])]
+        # Cells at the closed end of a slit may share their first corner.
+        of_blocks = of_blocks.reshape(-1, 8)
+        of_lattice = corners[:, BY_AXIS].astype(of_blocks.dtype)
+        every = whole_rows(np.concatenate([of_blocks, of_lattice]))
+        _, first, number = np.unique(every, return_index=True, return_inverse=True)
+        self.lanes = first[number[len(of_blocks) :]]
         weights, number = np.repeat(self.cells.volume, 8), np.repeat(np.arange(len(corners)), 8)
         around = csr_array(
             (weights, (corners.ravel(), number)), shape=(len(lattice.nodes), len(corners))

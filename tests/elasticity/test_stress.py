@@ -4,7 +4,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import block_scene, play, solid_of
+import trimesh
+from block_scene import CELL, block_scene, play, solid_of
 from test_neo_hookean import YOUNG, H, solid
 
 from msmpetsc.build import Model
@@ -123,3 +124,20 @@ def test_springs_are_refused_in_one_line(tmp_path):
     with pytest.raises(InputError, match=r"output: .*springs have no stress") as refused:
         play(scene)
     assert "\n" not in str(refused.value)
+
+
+def test_both_sides_of_a_slit_have_their_own_stress(tmp_path):
+    """A fork open towards x: a cell's two copies have the first corner at the slit's closed end."""
+    bar, gap = trimesh.creation.box(bounds=[[0, 0, 0], [8, 2, 5]]), [[2, -1, 2.3], [9, 3, 2.5]]
+    slit = trimesh.creation.box(bounds=gap)
+    fork = trimesh.boolean.difference([bar, slit], engine="manifold").apply_scale(CELL)
+    scene = block_scene(
+        tmp_path, **STATIC, material=of_law(0.3), pin=[{"region": along_x(-0.01, 0.01)}],
+        force=[{"region": {"box": [[0.9, -1, 0.4], [2, 1, 1]]}, "total": [0, 0, 0.5]}],
+    )  # fmt: skip
+    fork.export(tmp_path / "scene.ply")
+    model, frame = at_rest(scene)
+    cells = model.lattice.local_cells
+    assert len(np.unique(cells[:, 0])) < len(cells)
+    energy = frame.cell_strain_energy @ model.lattice.solid.volume
+    assert energy == pytest.approx(frame.elastic, rel=1e-6)

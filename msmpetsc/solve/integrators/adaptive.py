@@ -289,8 +289,13 @@ class Adaptive(Integrator):
         return replace(total, time_error=self.control.estimate), state
 
     def _within(self, total: StepResult, state: State, remaining: float, time: float) -> StepResult:
-        """Return the result at ``time``, the ``remaining`` part of the last step before its end."""
+        """Return the result at ``time``, the ``remaining`` part of the last step before its end.
+
+        Before its end there are no forces of the step: inertia, friction and viscosity.
+        """
         q, v = state.q, state.velocity(self.time_step)
+        if remaining > 0:
+            total = replace(total, problem=None, viscous=None)
         if remaining > 0 and state.history:
             q, v = between(*state.history, q, v, self._length(self.last), 1 - remaining)
             prescribed = self.environment.anchors.prescribed(q, time)

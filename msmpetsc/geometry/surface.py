@@ -165,9 +165,14 @@ def merged_triangles(surface: Surface) -> Indices:
     Points of equal position get the lowest of their numbers; degenerate triangles are dropped.
     """
     triangles = first_of_equal(surface.points)[surface.triangles]
+    return triangles[have_three_corners(triangles)]
+
+
+def have_three_corners(triangles: Indices) -> Mask:
+    """Return which triangles (f,) name three different points."""
     a, b, c = triangles.T
-    whole: Mask = (a != b) & (b != c) & (c != a)
-    return triangles[whole]
+    three: Mask = (a != b) & (b != c) & (c != a)
+    return three
 
 
 def first_of_equal(points: Positions) -> Indices:

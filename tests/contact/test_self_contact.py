@@ -224,6 +224,18 @@ def test_triangles_that_cut_others_at_rest_are_left_out_and_named(tmp_path, capl
     assert count_crossings(model.surface.points, model.surface.triangles) > 0
 
 
+def test_a_triangle_that_names_a_point_twice_is_left_out(tmp_path):
+    path = block_scene(tmp_path, self_contact={}, time={"step": 0.01, "duration": 0.01})
+    block = trimesh.creation.box([0.5, 0.5, 0.25]).subdivide().subdivide().subdivide()
+    rows = [*(block.faces + 1), (1, 1, 2), (3, 3, 3)]
+    lines = [f"v {x} {y} {z}" for x, y, z in block.vertices]
+    lines += [f"f {a} {b} {c}" for a, b, c in rows]
+    (tmp_path / "scene.obj").write_text("\n".join(lines))
+    model = model_of(path, 'mesh.source="scene.obj"')
+    assert len(model.surface.triangles) == len(rows)
+    assert len(model.collision.surface.triangles) == len(block.faces)
+
+
 def test_a_surface_that_cuts_itself_all_over_is_refused(tmp_path):
     path = pinch_scene(tmp_path)
     trimesh.util.concatenate([u_tube(), u_tube(around=15, along=57)]).export(tmp_path / "u.ply")

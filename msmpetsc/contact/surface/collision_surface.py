@@ -21,7 +21,7 @@ from msmpetsc.geometry.cages import BodySurface, Cages
 from msmpetsc.geometry.embedding import embed
 from msmpetsc.geometry.grid import ON_PLANE
 from msmpetsc.geometry.prepare import simplify
-from msmpetsc.geometry.surface import Surface, compact, joined, outward
+from msmpetsc.geometry.surface import Surface, compact, have_three_corners, joined, outward
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.obstacles import SelfContactTable
 from msmpetsc.scene.reading import Scene
@@ -94,11 +94,16 @@ def _prepared(
     """Return the contact surfaces, their distance from the bodies' surfaces, and their mean edge.
 
     The surfaces have about as many triangles as the table asks for; all triangles if it names no
-    number. Crossing triangles are left out. The distance is the median over the bodies' points [m].
+    number. Triangles that cross, or name a point twice, are left out. The distance is the median
+    over the bodies' points [m].
 
     Raises InputError if too many triangles cross.
     """
-    off = 0.0
+    off, three = 0.0, [have_three_corners(body.triangles) for body in bodies]
+    bodies = [
+        body if kept.all() else compact(body.points, body.triangles[kept])
+        for body, kept in zip(bodies, three, strict=True)
+    ]
     if table.surface is not None:
         share = table.surface / sum(len(body.triangles) for body in bodies)
         coarser = [

@@ -306,6 +306,12 @@ def test_where_the_coarsest_lattice_fails_a_finer_one_stands_in(tmp_path: Path, 
     assert plan.met and not plan.bounds and {each.cells for each in plan.tried} >= {200, 800, 6400}
 
 
+def test_lattices_alike_are_one_lattice(tmp_path: Path, monkeypatch):
+    """A single cell is its own coarser lattice."""
+    with pytest.raises(InputError, match=r"only one lattice could be run.*--cells N"):
+        sized(tmp_path, monkeypatch, 0.1, cells=1)
+
+
 # by the bound of the error: the target, and properties of the bodies
 BOUNDS = {
     # at most 8 times the cells are allowed, which leaves 1.8e-2

@@ -183,13 +183,15 @@ class Sizer:
             run for power in COARSEST_POWERS if (run := self._run(method, self._coarser(power)))
         )
         finer = (self._run(method, self._coarser(power)) for power in (1, 0))
-        runs = [run for run in (next(coarsest, None), *finer) if run is not None]
+        # different numbers of a few cells may give the same lattice
+        runs = {run.edge: run for run in (next(coarsest, None), *finer) if run is not None}
         if len(runs) < 2:
             raise InputError(
                 f"{self.scene}: only one lattice could be run, see above: "
-                "the error of the cells is not known"
+                "the error of the cells is not known; --cells N says how many cells the finest "
+                "trial has"
             )
-        return runs
+        return list(runs.values())
 
     def _law(self, runs: list[SizeTrial], coarser: ErrorLaw | None = None) -> ErrorLaw:
         """Return the law of the cells' error from runs on two or three lattices.

@@ -2,9 +2,9 @@
 
 import logging
 import shlex
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -34,6 +34,7 @@ from msmpetsc.backend import kernel_cache
 from msmpetsc.build import Model, build_model
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, StepFailed
+from msmpetsc.fields import Frame
 from msmpetsc.results.checkpoint_reader import Earlier, end_of_run
 from msmpetsc.results.progress_bar import Progress
 from msmpetsc.results.writer import Begin, ResultFile, write_model
@@ -127,11 +128,12 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> tuple[Checkpoints, Cost, S
                 is_shown = comm.rank == 0 and log.isEnabledFor(logging.INFO)
                 set_up.close()
                 with closing(Progress(simulation.steps, is_shown)) as progress:
-                    observers = [
-                        cost.count,
-                        progress.update,
-                        *filter(None, [plan.request.on_frame]),
-                    ]
+                    observers: list[Callable[[Frame], object]] = [cost.count, progress.update]
+                    if on_frame := plan.request.on_frame:
+                        # the next step still needs the frame's own positions
+                        observers.append(
+                            lambda frame: on_frame(replace(frame, position=frame.position.copy()))
+                        )
                     signals.begin(file.abandon)
                     for frame in checkpoints.steps():
                         with cost.of_output():

@@ -177,6 +177,19 @@ def test_a_callback_sees_each_stored_frame(scene: Path, tmp_path: Path):
         assert np.array_equal([frame.position for frame in seen], result.frames.position[:])
 
 
+def test_a_callback_may_change_its_frame(scene: Path, tmp_path: Path):
+    def turn(frame: msm.Frame) -> None:
+        x = frame.position
+        x -= x.mean(axis=0)
+
+    left, changed = (
+        msm.run(scene, tmp_path / name, on_frame=called, quiet=True)
+        for name, called in (("left.h5", None), ("changed.h5", turn))
+    )
+    with msm.open(left) as expected, msm.open(changed) as found:
+        assert np.array_equal(found.frames.position[:], expected.frames.position[:])
+
+
 def test_frames_are_those_of_every_third_step_and_the_last(tmp_path: Path):
     """Nothing is computed for steps left out. The cost of all steps is summed up."""
     time, solver = {"step": 0.02, "duration": 0.14}, {"preset": "anderson", "error": 1e-6}

@@ -93,6 +93,7 @@ def entry_point() -> None:
 
     The program exits quietly if the reader of its output closes the pipe, as ``head -1`` does.
     """
+    _open_closed_streams()
     try:
         try:
             status = main()
@@ -107,6 +108,17 @@ def entry_point() -> None:
     # a late Ctrl-C must not change the exit status
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     sys.exit(status)
+
+
+def _open_closed_streams() -> None:
+    """Open the null device for each standard stream that is closed, as by ``2>&-``.
+
+    Without that a result file would get the descriptor, and lines of C libraries with it.
+    """
+    # in the order of the descriptors, as the lowest free descriptor is opened
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode))  # noqa: SIM115
 
 
 # ---- arguments

@@ -13,6 +13,7 @@ from block_scene import YOUNG, block_scene, solid_of
 from conftest import ENVIRONMENT, python
 from one_process import command_error, status_of
 
+import msmpetsc
 from msmpetsc.backend import kernel_cache
 from msmpetsc.cli.command_table import COMMANDS
 from msmpetsc.cli.commands import doctor
@@ -101,6 +102,20 @@ def test_who_stops_reading_ends_the_command_quietly(command: str):
     done = subprocess.run(words, env=ENVIRONMENT, stdout=writer, stderr=subprocess.PIPE)
     os.close(writer)
     assert done.stderr == b"" and done.returncode == 128 + signal.SIGPIPE
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
+def test_a_run_needs_no_stream(tmp_path: Path, closed: str):
+    """As a service starts it: no file of the run gets the descriptor of a stream."""
+    scene = block_scene(tmp_path, time=ONCE)
+    words = [sys.executable, "-m", "msmpetsc", "run", str(scene), "-o", str(tmp_path / "x.h5")]
+    done = subprocess.run(
+        f"{shlex.join(words)} -ksp_view {closed}",
+        shell=True, env=ENVIRONMENT, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0 and "Traceback" not in done.stdout + done.stderr
+    with msmpetsc.open(tmp_path / "x.h5") as result:
+        assert len(result.frames) == 2
 
 
 def test_doctor_finds_a_sound_installation_sound():

@@ -89,7 +89,10 @@ def refuse_early(comm: MPI.Comm) -> None:
 
 
 def _bounds_passed(name: str, value: str) -> Iterator[str]:
-    """Yield a message if the value of an option is a number outside its bounds."""
+    """Yield a message if an option's number is missing or outside its bounds."""
+    # PETSc drops such an option, and the preset's value with it
+    if not value and (COUNT.fullmatch(name) or POSITIVE.fullmatch(name)):
+        yield "it needs a number"
     if re.search(r"(^|,)[-+]?nan\b", value, re.IGNORECASE):
         yield f"{value} is not a number"
     try:

@@ -301,7 +301,9 @@ def _warn_of_masses(
     cells : grid index, kind and fill of this rank's cells of each body
     """
     own = [len(ijk) if cut is None else cut[0].mean(axis=(1, 2, 3)).sum() for ijk, _, cut in cells]
-    filled = bodies[0].comm.allreduce(np.array(own, float)) * cell_size**3
+    # of corners far from the inside, which _clipped gives a mass
+    far = [0 if cut is None else cut[0][cut[0] <= LEAST_FILL].sum() / 8 for _, _, cut in cells]
+    filled, raised = bodies[0].comm.allreduce(np.array([own, far], float)) * cell_size**3
     enclosed = np.array([abs(body.report.volume) for body in bodies])
     # the volume of an open mesh has no meaning
     closed = np.array([body.report.closed for body in bodies])
@@ -313,6 +315,8 @@ def _warn_of_masses(
         remedy = f'cages.boundary = "{boundary}" counts cut cells whole'
     elif cells[worst][2] is None:
         remedy = "cut cells count whole"
+    elif excess[worst] > 0 and raised[worst] > (filled - enclosed)[worst] / 2:
+        remedy = "it is far thinner than a cell, which smaller cells mend"
     elif excess[worst] > 0:
         remedy = 'some parts are wound inwards, which prepare = ["orient"] mends'
     else:

@@ -166,6 +166,7 @@ PARTS = {
         [BALL, moved(BALL, 3), moved(BALL, 6, inwards=True)],
         "some parts are wound inwards",
     ),
+    "a sheet": ([trimesh.creation.box((1, 0.5, 1e-4))], "far thinner than a cell"),
     "in each other": ([BALL, moved(CORE, 0.1)], "parts overlap or lie in each other"),
     "over each other": ([BALL, moved(BALL, 1)], "parts overlap or lie in each other"),
 }

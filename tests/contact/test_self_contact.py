@@ -243,6 +243,18 @@ def test_a_surface_that_cuts_itself_all_over_is_refused(tmp_path):
         model_of(path)
 
 
+def test_a_coarser_surface_that_cuts_itself_is_no_fault_of_the_mesh(tmp_path):
+    """Flat faces leave slivers on the edges of the coarser surface."""
+    path = block_scene(
+        tmp_path, self_contact={"surface": 300}, time={"step": 0.01, "duration": 0.01}
+    )
+    block = trimesh.creation.box([0.5, 0.5, 0.25]).subdivide().subdivide().subdivide()
+    block.export(tmp_path / "scene.ply")
+    with pytest.raises(InputError, match=r"leave out self_contact\.surface"):
+        model_of(path)
+    assert model_of(path, "self_contact={}").collision is not None
+
+
 def test_a_coarser_surface_lies_on_the_body_says_how_far_it_is_off_and_pushes_from_there(
     tmp_path, caplog
 ):

@@ -115,7 +115,7 @@ def _prepared(
         # Points within ON_PLANE of a plane of the grid snap to it, which would close a
         # smaller gap
         gap = max(NEAREST * (table.distance or NEAR * longest), 2 * ON_PLANE * longest)
-        bodies = _without_crossing_triangles(_parted(bodies, gap))
+        bodies = _without_crossing_triangles(_parted(bodies, gap), table.surface is not None)
     ends = np.concatenate(
         [b.points[b.triangles] - b.points[np.roll(b.triangles, 1, axis=1)] for b in bodies]
     )
@@ -192,8 +192,11 @@ def _parted(bodies: list[Surface], gap: float) -> list[Surface]:
     return [Surface(body.points - gap * outward(body), body.triangles) for body in bodies]
 
 
-def _without_crossing_triangles(bodies: list[Surface]) -> list[Surface]:
-    """Return surfaces without crossing triangles. Raises InputError if too many cross."""
+def _without_crossing_triangles(bodies: list[Surface], are_coarser: bool) -> list[Surface]:
+    """Return surfaces without crossing triangles. Raises InputError if too many cross.
+
+    are_coarser : whether the surfaces are coarser than the mesh, which may make them cross
+    """
     whole = joined(bodies)
     assert whole is not None
     cut = Barrier(whole, BarrierLaw(1.0, 1.0, 0.0, 1.0), len(whole.points)).crossings()
@@ -206,10 +209,10 @@ def _without_crossing_triangles(bodies: list[Surface]) -> list[Surface]:
         names = ", ".join(f"body.{number}" for number in of)
         fault += f" (of {names}, which must be moved apart if they overlap)"
     if len(cut) > MOST_CUT * len(whole.triangles):
-        raise InputError(
-            f"{fault}, too many to leave out: "
-            'mesh.prepare = ["union"] or ["repair"] may mend the mesh'
-        )
+        remedy = 'mesh.prepare = ["union"] or ["repair"] may mend the mesh'
+        if are_coarser:
+            remedy = f"leave out self_contact.surface, or raise it; if that fails, {remedy}"
+        raise InputError(f"{fault}, too many to leave out: {remedy}")
     log.warning("%s: they are left out, and may be crossed", fault)
     of_body = np.split(~np.isin(np.arange(len(whole.triangles)), cut), ends)
     return [compact(b.points, b.triangles[kept]) for b, kept in zip(bodies, of_body, strict=True)]

@@ -29,8 +29,9 @@ FULL_TYPE_SIDES = np.array([480, 720])
 SMALLEST_TYPE = 0.5
 # highest frame rate [1/s]
 MAX_FPS = 30.0
-# range of a film's default length [s]
+# range of a film's default length, and greatest length [s]
 LENGTHS = (3.0, 8.0)
+LONGEST_FILM = 3600.0
 # factors times powers of ten of the default speed
 STEPS = (1, 2, 5)
 
@@ -78,7 +79,7 @@ def playback_of(times: Floats, speed: float | None = None) -> Playback:
     times : (k,) of the frames [s]
     speed : simulated seconds per second; None for a round speed by which the film lasts 3 to 8 s
 
-    Raises InputError for a speed of frames that are shown in turn.
+    Raises InputError for a speed of frames that are shown in turn, and for a film of over an hour.
     """
     steps = np.diff(times)
     if len(times) == 1 or not (steps > 0).all():
@@ -86,6 +87,8 @@ def playback_of(times: Floats, speed: float | None = None) -> Playback:
             raise InputError("--speed needs frames in order of time, more than one")
         return Playback(np.arange(len(times)), MAX_FPS / 3, 0.0)
     speed = speed or usual_speed(float(times[-1] - times[0]))
+    if (seconds := float(times[-1] - times[0]) / speed) > LONGEST_FILM:
+        raise InputError(f"--speed {speed:g}: the film would last {seconds:.2g} s, over an hour")
     fps = max(1.0, min(MAX_FPS, speed / float(np.median(steps))))
     shown = times[0] + np.arange(
         0, (times[-1] - times[0]) * (1 + 1e-9) + speed / fps / 2, speed / fps

@@ -165,6 +165,7 @@ def test_the_legend_names_what_is_drawn(falling_ball, tmp_path):
         (["--speed", "10"], r"--speed is for \*.mp4"),
         (["-o", "x.mp4", "--speed", "0"], "--speed must be above 0"),
         (["-o", "x.mp4", "--speed", "nan"], "--speed must be above 0"),
+        (["-o", "x.gif", "--speed", "1e-300"], "--speed 1e-300: the film would last"),
         (["-o", "x.mp4", "--count", "3"], r"--count is for \*.png"),
         (["-o", "x.html", "--size", "100x100"], r"--size is for \*.png"),
         (["-o", "x.html", "--cells"], r"--cells is for \*.png"),

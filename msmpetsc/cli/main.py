@@ -105,8 +105,9 @@ def entry_point() -> None:
         for stream in (sys.stdout, sys.stderr):
             os.dup2(devnull, stream.fileno())
         status = 128 + signal.SIGPIPE
-    # a late Ctrl-C must not change the exit status
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # a late signal must not change the exit status
+    for number in (signal.SIGINT, signal.SIGUSR1):
+        signal.signal(number, signal.SIG_IGN)
     sys.exit(status)
 
 

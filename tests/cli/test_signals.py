@@ -23,6 +23,7 @@ from stopped_runs import (  # noqa: F401  # a fixture
     signal_after,
 )  # fmt: skip
 
+from msmpetsc.app import running
 from msmpetsc.cli.main import main
 from msmpetsc.results.untrusted_file import finished
 
@@ -84,6 +85,29 @@ def test_a_signal_in_the_last_step_comes_too_late(whole: Path, tmp_path, monkeyp
     assert status_of("run", whole.parent / "scene.toml", "-o", path) == 0
     assert "stopped" not in capsys.readouterr().err
     assert_same(path, whole)
+
+
+@pytest.mark.parametrize("phase", ["prepare", "write_companions"])
+def test_a_request_to_stop_kills_no_run_outside_its_steps(
+    whole: Path, tmp_path, monkeypatch, phase: str
+):
+    """Before the first step it is heeded at step 0, after the last step it is in vain."""
+    path, killed, of_phase = tmp_path / "x.h5", [], getattr(running, phase)
+
+    def signalled(*given: object, **more: object) -> object:
+        os.kill(os.getpid(), signal.SIGUSR1)
+        return of_phase(*given, **more)
+
+    monkeypatch.setattr(running, phase, signalled)
+    before = signal.signal(signal.SIGUSR1, lambda *_: killed.append(phase))
+    try:
+        words = "-o", path, "--measure", path.with_suffix(".json")
+        assert status_of("run", whole.parent / "scene.toml", *words) == 0
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+    assert not killed and path.with_suffix(".json").exists()
+    with h5py.File(path) as file, h5py.File(whole) as other:
+        assert finished(file) == (1 if phase == "prepare" else finished(other))
 
 
 def start(*arguments: object, ranks: int = 1) -> subprocess.Popen:
@@ -177,11 +201,12 @@ INTERRUPTED_AT_THE_END = """
 import atexit, os, signal
 from msmpetsc.cli import main
 main.main = lambda: 143
-atexit.register(os.kill, os.getpid(), signal.SIGINT)
+atexit.register(os.kill, os.getpid(), signal.{})
 main.entry_point()
 """
 
 
-def test_an_interrupt_after_the_end_changes_nothing():
-    done = python("-c", INTERRUPTED_AT_THE_END)
+@pytest.mark.parametrize("name", ["SIGINT", "SIGUSR1"])
+def test_a_signal_after_the_end_changes_nothing(name: str):
+    done = python("-c", INTERRUPTED_AT_THE_END.format(name))
     assert done.returncode == 143 and done.stderr == ""

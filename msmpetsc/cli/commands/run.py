@@ -1,11 +1,14 @@
 """``msmpetsc run``: simulate a scene and write its result file."""
 
 import argparse
+import signal
+from types import FrameType
 
 from mpi4py import MPI
 
 from msmpetsc.app.request import OPTIONS, RunRequest
 from msmpetsc.app.start import carry_out, options_shown
+from msmpetsc.comm import Stop
 
 
 def run(args: argparse.Namespace) -> int:
@@ -13,8 +16,18 @@ def run(args: argparse.Namespace) -> int:
     comm = MPI.COMM_WORLD
     request = RunRequest(**{name: value for name, value in vars(args).items() if name in OPTIONS})
     if not args.show_options:
-        return carry_out(comm, request)
+        # the signal must not kill a run that is being set up, or writes its last files
+        before = signal.signal(signal.SIGUSR1, _ask_to_stop)
+        try:
+            return carry_out(comm, request)
+        finally:
+            signal.signal(signal.SIGUSR1, before)
     lines = options_shown(comm, request)
     if comm.rank == 0:
         print("\n".join(lines))
     return 0
+
+
+def _ask_to_stop(number: int, _: FrameType | None) -> None:
+    """Stop the run after its first step, if it has not begun; do nothing after its last step."""
+    Stop.signal = number

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
+from numbers import Integral
 from os import PathLike
 from pathlib import Path
 from time import perf_counter
@@ -240,6 +241,8 @@ class Simulation:
         """
         scene = self.scene.changed(set or {})
         if frames is not None:
+            if not isinstance(frames, Integral):
+                raise InputError(f"frames must be a whole number, not {frames!r}")
             if frames < 1:
                 raise InputError(f"frames must be at least 1, not {frames}")
             scene = scene.changed({"time.duration": frames * scene.time.step})

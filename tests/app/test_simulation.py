@@ -86,8 +86,9 @@ def test_changes_are_checked_as_a_file_is(scene: Path):
         with pytest.raises(InputError, match=words):
             # the error comes at the call, before the first frame
             simulation.frames(set={wrong: 1.0})
-    with pytest.raises(InputError, match="frames must be at least 1"):
-        simulation.frames(0)
+    for frames, words in {0: "at least 1, not 0", 1.5: "a whole number, not 1.5"}.items():
+        with pytest.raises(InputError, match=f"frames must be {words}"):
+            simulation.frames(frames)
     with pytest.raises(InputError, match="unknown preset 'newtno', did you mean 'newton'"):
         next(simulation.frames(set={"solver.preset": "newtno"}))
     with pytest.raises(InputError, match="scene: must give exactly one of mesh, body"):

@@ -32,12 +32,16 @@ class FirstGuess:
             return y
         flight = y.copy()
         flight[: lattice.owned] += self.functional.t2 * problem.load / lattice.mass[:, None]
-        guesses = [y, q + self.drift(flight - q)]
+        surface = self.functional.surface
+        pressing = surface if surface is not None and surface.presses(q) else None
+        guesses = [y]
+        # Its mean would lead through obstacles that press; beyond them g means nothing.
+        if pressing is None or not pressing.contacts.obstacles.total:
+            guesses.append(q + self.drift(flight - q))
         if self.corrections:
             guesses.append(y + 2 * self.corrections[0] - self.corrections[-1])
-        surface = self.functional.surface
         # A free flight would lead into the parts that press each other
-        if surface is None or not surface.presses(q):
+        if pressing is None:
             guesses.append(flight)
         values = [self.functional.value(self.with_fixed(guess)) for guess in guesses]
         return guesses[int(np.argmin(values))]

@@ -175,11 +175,16 @@ class Resumed:
 
     def refuse_other_lattice(self, comm: MPI.Comm, model: "Model") -> None:
         """Raise InputError if the lattice differs from the earlier run's lattice (collective)."""
-        lattice = model.lattice
-        rows = {"lattice/nodes": lattice.nodes[: lattice.owned]}
+        lattice, own = model.lattice, slice(model.lattice.owned)
+        rows = {"lattice/nodes": lattice.nodes[own]}
         if not self.differs:
             rows["lattice/mass"] = lattice.mass
         refuse_changed_lattice(comm, self.earlier.path, rows)
+        if not self.differs:
+            # a painted region has its points from a file of its own
+            pinned = {"lattice/pinned": lattice.global_numbers[own][lattice.pinned[own]]}
+            words = "a file that a pin names has changed"
+            refuse_changed_lattice(comm, self.earlier.path, pinned, words)
 
     def restore(self, comm: MPI.Comm, file: ResultFile, simulation: "TimeLoop") -> None:
         """Restore the simulation from the last checkpoint, if any (collective)."""

@@ -192,7 +192,7 @@ def longest_side(points: Positions, body: Indices) -> float:
 
 def rows_agree(a: Array, b: Array, tolerance: float) -> Mask:
     """Return whether the rows (n,) of a and b, (n, 3) or (n,), differ by at most ``tolerance``."""
-    rows: Array = (a - b).reshape(len(a), -1)
+    rows: Array = (a - b).reshape(len(a), *a.shape[1:] or (1,))
     agree: Mask = np.linalg.norm(rows, axis=1) <= tolerance
     return agree
 

@@ -408,6 +408,19 @@ def test_another_mesh_is_refused_in_one_line(stopped: Path, tmp_path):
         assert finished(file) == 4 and max(file["checkpoint/step"]) == 10
 
 
+def test_other_painted_points_are_refused_in_one_line(tmp_path, monkeypatch):
+    path, points = tmp_path / "x.h5", tmp_path / "points.txt"
+    points.write_text("0 1 2 3")
+    scene = hanging(tmp_path, pin=[{"region": {"painted": points.name}}])
+    with monkeypatch.context() as patch:
+        signal_after(patch, 10, signal.SIGUSR1)
+        assert status_of("run", scene, "-o", path) == 0
+    points.write_text("4 5 6 7")
+    assert "a file that a pin names has changed" in command_error("run", "--resume", path)
+    points.write_text("0 1 2 3")
+    assert status_of("run", "--resume", path) == 0
+
+
 @pytest.mark.parametrize(("step", "value"), [(9, 1e160), (10, 1e8)])
 @pytest.mark.parametrize("name", ["q", "q_previous"])
 def test_positions_that_no_frame_knows_are_refused(

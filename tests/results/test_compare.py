@@ -11,7 +11,14 @@ from small_result import DT, FRAMES, NODES, POINTS, frame, number, position
 
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
-from msmpetsc.results.comparison import COMPARED, compare, compare_surfaces, difference, point_areas
+from msmpetsc.results.comparison import (
+    COMPARED,
+    compare,
+    compare_surfaces,
+    difference,
+    point_areas,
+    rows_agree,
+)
 from msmpetsc.results.reader import Result
 from msmpetsc.study.metrics import surface_error
 
@@ -240,3 +247,9 @@ def test_other_meshes_are_refused_in_one_line(a: Path, tmp_path: Path):
 )
 def test_odd_options_are_refused(a: Path, options: list[str]):
     assert command_error("compare", a, a, *options)
+
+
+@pytest.mark.parametrize("shape", [(0,), (0, 3)])
+def test_no_rows_agree(shape: tuple[int, ...]):
+    """As those of a rank without a pin."""
+    assert rows_agree(np.zeros(shape), np.zeros(shape), 0.0).shape == (0,)

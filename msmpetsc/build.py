@@ -26,7 +26,6 @@ from msmpetsc.extensions import FORCES
 from msmpetsc.geometry.cages import BodySurface, Cages, fill
 from msmpetsc.geometry.cell_size import choose_cell_size, warn_of_thin_bodies
 from msmpetsc.geometry.embedding import embed
-from msmpetsc.geometry.morton import COPIES
 from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.registry import load
 from msmpetsc.geometry.surface import (
@@ -43,8 +42,10 @@ from msmpetsc.lattice.cell_materials import cell_materials
 from msmpetsc.lattice.embedded_surface import surface_part
 from msmpetsc.lattice.initial_state import InitialState, ReadState, initial_state
 from msmpetsc.lattice.lattice import Lattice, build_lattice
-from msmpetsc.lattice.region import Finder, nearest_in_bodies
-from msmpetsc.lattice.topology import Topology, topology_of
+from msmpetsc.lattice.nearest_points import NodePoints, nearest_of_body
+from msmpetsc.lattice.probes import ProbePoints, probe_points
+from msmpetsc.lattice.region import Finder
+from msmpetsc.lattice.topology import topology_of
 from msmpetsc.scene.motion import Gravity, Traction
 from msmpetsc.scene.obstacles import BARRIER, ObstacleTable
 from msmpetsc.scene.reading import Scene
@@ -78,6 +79,7 @@ class Model:
     own_forces  : forces that are functions of the state at the start of a step
     obstacles   : all obstacles in the scene's order
     holders     : pins and anchors, and the nodes that each holds
+    probe       : points to probe; None if there are none
     """
 
     surface: Surface | None
@@ -100,6 +102,7 @@ class Model:
     holders: Holders = field(
         default_factory=lambda: Holders((), np.zeros(0, np.int64), np.zeros((0, 3)))
     )
+    probe: ProbePoints | None = None
 
     @property
     def body_of_point(self) -> Indices:
@@ -146,6 +149,9 @@ class Geometry:
         self.bodies = read_bodies(comm, scene)
         self.cages = fill_cages(self.bodies, scene)
         self.topology = topology_of(self.cages)
+        nodes = self.topology.table.total
+        if nodes < comm.size:
+            raise InputError(f"cages: {comm.size} ranks are more than the {nodes} nodes to share")
 
     def fits(self, scene: Scene) -> bool:
         """Return whether a scene has the meshes and cages of this geometry."""
@@ -162,8 +168,8 @@ class Geometry:
         return embed(points, self.cages, self.topology.table, cages.embedding, cages.smoothing)
 
     @cached_property
-    def nearest(self) -> Positions:
-        """Return the nearest point (l, 3) [m] of its body for each node (collective)."""
+    def nearest(self) -> NodePoints:
+        """Return the nearest point of its body for each node (collective)."""
         return nearest_of_body(self.bodies, self.cages, self.topology)
 
     def outside(self, nodes: Positions) -> Floats | None:
@@ -171,26 +177,11 @@ class Geometry:
 
         Collective.
         """
-        return None if self.cages.fills is None else np.linalg.norm(nodes - self.nearest, axis=1)
-
-
-def nearest_of_body(bodies: Sequence[BodySurface], cages: Cages, topology: Topology) -> Positions:
-    """Return the nearest point (l, 3) [m] of its body for each node at rest (collective).
-
-    The nearest point is the node itself, except for corners of boundary cells, which stick out
-    of the surface by up to a cell diagonal. An obstacle should meet the surface, not the lattice.
-    So a node that sticks out by d meets the obstacle at depth d, where the surface is. This is
-    exact, for any rotation of the body, if the surface is flat over a cell. With whole cells
-    the lattice is the body, and each node is its own nearest point.
-    """
-    owned = topology.ijk[: len(topology.octants)]
-    body = cages.grids.body_of(owned)
-    # a node shared by eight valid cells is inside, or in a narrow fold of the surface
-    is_inside = topology.octants.all(axis=1) & (topology.table.keys % COPIES == 0)
-    rows = np.flatnonzero(~is_inside & np.array(cages.is_weighted)[body])
-    nearest = cages.grids.node_positions(owned)
-    nearest[rows] = nearest_in_bodies(bodies, nearest[rows], body[rows])
-    return topology.table.with_ghosts(topology.ghosts, nearest)
+        return (
+            None
+            if self.cages.fills is None
+            else np.linalg.norm(nodes - self.nearest.points, axis=1)
+        )
 
 
 def build_model(
@@ -210,8 +201,9 @@ def build_model(
     materials = cell_materials(scene, finder)
     lattice = build_lattice(cages, scene.material, materials, geometry.topology)
     tables = [table for kind in ("pin", "anchor", "force") for table in scene.tables(kind)]
-    points = geometry.nearest if tables else lattice.nodes
-    masks = {table.key: finder.find(table, lattice, points) for table in tables}
+    own = NodePoints(lattice.nodes, np.zeros(len(lattice.nodes), bool))
+    nearest = geometry.nearest if tables else own
+    masks = {table.key: finder.find(table, lattice, nearest) for table in tables}
     components = {t.key: masks[t.key][:, None] & np.array(t.table.fixed) for t in holders_of(scene)}
     lattice = lattice.pin(
         reduce(np.logical_or, (components[pin.key] for pin in scene.tables("pin")), lattice.fixed)
@@ -225,10 +217,13 @@ def build_model(
     areas, pressures = _surface_loads(scene, finder, lattice)
     loads += areas
     lattice = replace(lattice, pressed=tuple(pressure.part for pressure in pressures))
+    probes = probe_points(bodies, scene.output.probe)
     exchanges, penalties = _contacts(comm, scene.obstacle, lattice, finder.bounds, obstacles)
     model = Model(
         surface=joined([body.surface for body in bodies if body.surface is not None]),
-        lattice=clamped(scene, lattice, masks, finder, points),
+        lattice=clamped(
+            scene, lattice, masks, finder, nearest.points if nearest else lattice.nodes
+        ),
         embedding=geometry.embedding if scene.output.surface else None,
         loads=loads,
         own_forces=own_forces,
@@ -245,6 +240,7 @@ def build_model(
         retardation=scene.material.retardation_time,
         obstacles=tuple(obstacles),
         holders=holders,
+        probe=ProbePoints(lattice, cages, probes) if probes else None,
     )
     # at the end, because a refused scene needs no advice
     warn_of_thin_bodies(bodies, lattice.cell_size, scene.material.law)

@@ -58,7 +58,8 @@ class PartsOfPoints:
     """Finder of the part of a cell that holds a point on or near the surface.
 
     surface  : the body's surface
-    keys     : (s,) packed grid indices of the cells with several parts, ascending
+    keys     : (s,) packed grid indices of the cells with several parts, and of cells separated from
+               a neighbour, ascending
     cell     : (r,) number of the cell of each row, ascending
     triangle : (r,) triangle in the cell
     part     : (r,) part that the triangle bounds
@@ -79,13 +80,42 @@ class PartsOfPoints:
 
         cell = places_of(self.keys, packed(ijk))
         part = np.zeros(len(points), np.int64)
-        for number in np.unique(cell[cell >= 0]):
+        # a cell of a single part has part 0
+        for number in np.intersect1d(cell, self.cell[self.part > 0]):
             own = cell == number
             rows = slice(*np.searchsorted(self.cell, [number, number + 1]))
             triangles = self.surface.triangles[self.triangle[rows]]
             nearest = igl.point_mesh_squared_distance(points[own], self.surface.points, triangles)
             part[own] = self.part[rows][nearest[1]]
         return part
+
+    def nearest(self, points: Rows, ijk: Indices, part: Indices) -> Rows:
+        """Return the nearest points (n, 3) [m] of the parts around nodes at points (n, 3) [m].
+
+        A row is nan unless all of the node's parts are in cells of ``keys``.
+
+        ijk  : (n, 8, 3) cells around each node
+        part : (n, 8) part of which the node is a corner in each cell, -1 if there is none
+        """
+        import igl
+
+        nearest = np.full(points.shape, np.nan)
+        cell = np.where(part >= 0, places_of(self.keys, packed(ijk)), -1)
+        rows = np.flatnonzero(((cell >= 0) == (part >= 0)).all(axis=1) & (cell >= 0).any(axis=1))
+        of_cell = np.full(len(self.keys), -1)
+        for row, is_in in zip(rows, is_inside(self.surface, points[rows]), strict=True):
+            held = cell[row] >= 0
+            of_cell[cell[row, held]] = part[row, held]
+            around = _rows_of(self.cell, np.unique(cell[row, held]))
+            is_own = self.part[around] == of_cell[self.cell[around]]
+            triangles = self.surface.triangles[self.triangle[around]]
+            given = points[row : row + 1], self.surface.points
+            # a node within the body is in the part whose boundary is nearest
+            if is_in and is_own[igl.point_mesh_squared_distance(*given, triangles)[1]]:
+                nearest[row] = points[row]
+            elif is_own.any():
+                nearest[row] = igl.point_mesh_squared_distance(*given, triangles[is_own])[2]
+        return nearest
 
 
 @dataclass(frozen=True)
@@ -154,10 +184,13 @@ def parts_of(surface: Surface, grid: Grid, axes: Indices, volume: float) -> Cell
     sides = Sides(at_faces, split.faces.reshape(-1, LINES**2))
     crossing = _crossing_rows(codes, keys, size, flush, ends)
     links, separated = _links(surface, grid, keys, cell, part, crossing, sides)
-    own = _rows_of(cell, several)
-    own = own[part[own] >= 0]
-    of_several = np.searchsorted(several, cell[own])
-    points = PartsOfPoints(surface, keys[several], of_several, triangle[own], part[own])
+    kept = np.flatnonzero((count > 1) | separated)
+    own = _rows_of(cell, kept)
+    # a triangle in the low face of a cell of a single part bounds the body below
+    own = own[(part[own] >= 0) & ((count[cell[own]] > 1) | (flush[own] == 0))]
+    points = PartsOfPoints(
+        surface, keys[kept], np.searchsorted(kept, cell[own]), triangle[own], part[own]
+    )
     masks = sides.masks()
     return CellParts(keys, count, links, masks, separated, split.shares, split.spread, points)
 

@@ -56,6 +56,27 @@ class Copies:
         corners[own] = self.corners[row[own]]
         return corners
 
+    def parts_at_nodes(self, table: SortedKeys, keys: Indices) -> Indices:
+        """Return the part (n, 8) of which nodes (n,) are a corner in the cells around (collective).
+
+        It is -1 where no part of the cell has the node.
+
+        table : keys of all valid cells
+        """
+        places = decode_morton(keys)[:, None] + OCTANTS
+        cells = encode_morton(np.maximum(places, 0))[..., None] + np.arange(COPIES)
+        corners = self.corner_keys(cells, decode_morton(cells))
+        corner = np.take_along_axis(corners, np.arange(8)[None, :, None, None], axis=3)[..., 0]
+        is_valid = (table.find(cells) >= 0) & (places >= 0).all(axis=2)[..., None]
+        has = is_valid & (corner == keys[:, None, None])
+        parts: Indices = np.where(has.any(axis=2), has.argmax(axis=2), -1)
+        return parts
+
+    def suspects(self, keys: Indices) -> Mask:
+        """Return which nodes (n,) may have copies."""
+        places = np.unique(self.corners - self.corners % COPIES)
+        return np.isin(keys - keys % COPIES, places)
+
 
 NO_COPIES = Copies(np.empty(0, np.int64), np.empty((0, 8), np.int64))
 

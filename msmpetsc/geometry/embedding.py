@@ -78,17 +78,22 @@ def _to_cells(points: Sequence[Positions], cages: Cages) -> tuple[Indices, Indic
 
     Return the number (p,), the key of the cell (p,) and the coordinates in it (p, 3) of each.
     """
-    at = [grid.to_cells(of_body) for grid, of_body in zip(cages.grids.grids, points, strict=True)]
-    cells = [np.floor(of_body).astype(np.int64) for of_body in at]
-    u = np.concatenate([x - ijk for x, ijk in zip(at, cells, strict=True)])
-    ijk = np.concatenate([of_body + cages.grids.first(body) for body, of_body in enumerate(cells)])
-    copies = [
-        parts.find(of_body, ijk) if parts else np.zeros(len(ijk), np.int64)
-        for parts, of_body, ijk in zip(cages.parts, points, cells, strict=True)
-    ]
-    keys = encode_morton(ijk) + np.concatenate(copies)
+    of_bodies = [cells_at(cages, body, of_body) for body, of_body in enumerate(points)]
+    keys, u = (np.concatenate(rows) for rows in zip(*of_bodies, strict=True))
     route = Route(cages.table.comm, cages.table.owner(keys))
     return route.send(np.arange(len(u))), route.send(keys), route.send(u)
+
+
+def cells_at(cages: Cages, body: int, points: Positions) -> tuple[Indices, Rows]:
+    """Return the keys (n,) of cells that hold points (n, 3) [m], and coordinates in them (n, 3).
+
+    A cell with several parts has a copy for the part of each point. The points are of a body's
+    surface or inside it, on rank 0.
+    """
+    at, parts = cages.grids.grids[body].to_cells(points), cages.parts[body]
+    ijk = np.floor(at).astype(np.int64)
+    copy = parts.find(points, ijk) if parts else 0
+    return encode_morton(ijk + cages.grids.first(body)) + copy, at - ijk
 
 
 def _around(cages: Cages, keys: Indices) -> tuple[Mask, Indices]:

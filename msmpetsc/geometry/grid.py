@@ -125,12 +125,6 @@ class BodyGrids:
         body = self.body_of(ijk)
         return self._origins[body] + (ijk - self.first(body)) * self.cell_size
 
-    def nearest_nodes(self, points: Positions, body: Indices) -> Indices:
-        """Return the grid indices (..., 3) of the bodies' nodes nearest to points (..., 3) [m]."""
-        cells = np.rint((points - self._origins[body]) / self.cell_size)
-        nodes: Indices = cells.astype(np.int64) + self.first(body)
-        return nodes
-
 
 def packed(ijk: Indices) -> Indices:
     """Return a key (n,) for each grid index (n, 3); keys sort as (i, j, k) does."""

@@ -1,4 +1,4 @@
-"""Nodes and samples of cells in the regions of a scene, and its probes.
+"""Nodes and samples of cells in the regions of a scene.
 
 A region selects material (README: regions and clamps):
 
@@ -16,47 +16,23 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, to_host
+from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
 from msmpetsc.comm import Route, log, on_root
 from msmpetsc.errors import InputError, did_you_mean, printable
 from msmpetsc.geometry.cages import BodySurface, Cages, marked_cells
-from msmpetsc.geometry.grid import CORNERS
-from msmpetsc.geometry.inside import frame_of, inside_bodies
-from msmpetsc.geometry.morton import encode_morton
-from msmpetsc.geometry.surface import Surface, examine, is_inside
+from msmpetsc.geometry.embedding import cells_at
+from msmpetsc.geometry.inside import EDGE, frame_of, inside_bodies
+from msmpetsc.geometry.morton import COPIES, encode_morton
+from msmpetsc.geometry.surface import Surface, bounds_of, examine, is_inside
 from msmpetsc.geometry.valid_cells import Slab
 from msmpetsc.lattice.cell_samples import COUNT, CellSamples
 from msmpetsc.lattice.lattice import Lattice
+from msmpetsc.lattice.nearest_points import NodePoints, nearest_in_bodies
 from msmpetsc.scene.body import Region
-from msmpetsc.scene.schema import OfBody, Probe
+from msmpetsc.scene.schema import OfBody
 
-# tolerance of a point's place in a cell [cell]; a point of a face lies in both cells
-ON_FACE = 1e-9
 # names of groups in a message [-]; more fill the screen
 MOST_LISTED = 20
-
-
-def nearest_in_bodies(bodies: Sequence[BodySurface], points: Positions, body: Indices) -> Positions:
-    """Return the points (n, 3) [m] of bodies that are nearest to ``points`` (n, 3) (collective).
-
-    body : (n,) number of the body to search
-    """
-    # A scene without regions and obstacles starts without igl.
-    import igl
-
-    to_root = Route(bodies[0].comm, np.zeros(len(points), np.int64))
-    nearest = to_root.send(points)
-    of_point = to_root.send(body)
-    for number in np.unique(of_point):
-        own = of_point == number
-        surface = bodies[number].surface
-        # Rank 0 alone receives points, and it has the surfaces.
-        assert surface is not None
-        given = nearest[own]
-        closest = igl.point_mesh_squared_distance(given, surface.points, surface.triangles)[2]
-        nearest[own] = np.where(is_inside(surface, given)[:, None], given, closest)
-    answer: Positions = to_root.answer(nearest)
-    return answer
 
 
 @dataclass(frozen=True)
@@ -79,20 +55,19 @@ class Finder:
         """Bounding box at rest (b, 2, 3) [m] of each body."""
         return np.array([body.bounds for body in self.bodies])
 
-    def find(self, table: OfBody, lattice: Lattice, points: Positions) -> Mask:
+    def find(self, table: OfBody, lattice: Lattice, nearest: NodePoints) -> Mask:
         """Return the mask (l,) of local nodes in the region of a scene's table (collective).
 
-        points : (l, 3) body points nearest to the nodes [m]
+        nearest : body points nearest to the nodes
 
         Raises InputError on all ranks if the region has no node.
         """
         region = table.table.region
         if region.is_of_mesh:
-            nodes = self.cages.grids.nearest_nodes(lattice.nodes, lattice.body)
-            where = around = self._nodes_of_mesh(table, nodes, lattice.nodes, lattice.body)
+            where = around = self._nodes_of_mesh(table, lattice, nearest)
         else:
-            where = self.inside(table, points, lattice.body)
-            around = self.inside(table, lattice.nodes, lattice.body)
+            where = self.inside(table, nearest.points, lattice.body)
+            around = self.inside(table, lattice.nodes, lattice.body) & ~nearest.of_part
             where = where | self._at_edge(table, lattice, around & ~where)
         selected, outside = self.comm.allreduce(
             np.array([mask[: lattice.owned].sum() for mask in (where, around & ~where)])
@@ -136,7 +111,8 @@ class Finder:
         """
         where, keys = np.zeros((len(cells.ijk), COUNT), bool), encode_morton(cells.ijk)
         if table.table.region.painted is not None:
-            where[np.isin(keys, encode_morton(self._painted_cells(table)))] = True
+            painted = self._painted_cells(table)
+            where[np.isin(keys, painted - painted % COPIES)] = True
         elif table.table.region.group is not None:
             for number, group, marked in self._groups(table, are_nodes=False):
                 is_marked = np.isin(keys, marked)
@@ -191,24 +167,25 @@ class Finder:
             "" if region.is_of_mesh else f", the region {_extent(region, bounds[0])}"
         )
 
-    def _nodes_of_mesh(self, table: OfBody, ijk: Indices, points: Positions, body: Indices) -> Mask:
-        """Return the mask (n,) of nodes in a region of painted points or a group (collective).
+    def _nodes_of_mesh(self, table: OfBody, lattice: Lattice, nearest: NodePoints) -> Mask:
+        """Return the mask (l,) of nodes in a region of painted points or a group (collective).
 
         A group has the nodes that are nearest to a point of its triangles. A closed group has the
-        nodes that it encloses, too.
-
-        ijk    : (n, 3) grid index of the nodes
-        points : (n, 3) positions of the nodes [m]
-        body   : (n,) number of the body of each
+        nodes that it encloses, too. A node at a slit narrower than a cell counts by the nearest
+        point of its own side.
         """
+        keys = lattice.table.with_ghosts(lattice.ghosts, lattice.table.keys)
         if table.table.region.group is None:
-            keys = encode_morton((self._painted_cells(table)[:, None] + CORNERS).reshape(-1, 3))
-            return np.isin(encode_morton(ijk), keys)
-        where = np.zeros(len(ijk), bool)
+            return np.isin(keys, self.cages.corner_keys(self._painted_cells(table)))
+        where = np.zeros(len(keys), bool)
+        points = np.where(nearest.of_part[:, None], nearest.points, lattice.nodes)
         for number, group, marked in self._groups(table, are_nodes=True):
-            where |= np.isin(encode_morton(ijk), marked)
-            if examine(group).closed:
-                own = np.flatnonzero(body == number)
+            near, closed = np.isin(keys - keys % COPIES, marked), examine(group).closed
+            own = lattice.body == number
+            rows = np.flatnonzero(nearest.of_part & own & (near | closed))
+            where |= near & ~nearest.of_part
+            where[rows] |= _are_on(group, points[rows])
+            if closed:
                 where[own] |= is_inside(group, points[own])
         return where
 
@@ -229,11 +206,10 @@ class Finder:
             yield number, surface, encode_morton(marked + self.cages.grids.first(number))
 
     def _painted_cells(self, table: OfBody) -> Indices:
-        """Return the cells (k, 3) that contain painted points of a body's surface (collective)."""
+        """Return the keys (k,) of cells with painted points of a body's surface (collective)."""
         # A table without a body is of a scene with a single body.
         key, number = table.key, table.body or 0
         surface = self.bodies[number].surface
-        grid = self.cages.grids.grids[number]
 
         def cells() -> Indices:
             # Rank 0 alone calls this function, and it has the surface.
@@ -245,10 +221,10 @@ class Finder:
                     f"{key}.region.painted: there is no point {numbers.max()}: "
                     f"the surface has {len(points)}"
                 )
-            return np.unique(grid.to_cells(points[numbers]).astype(np.int64), axis=0)
+            return cells_at(self.cages, number, points[numbers])[0]
 
-        of_body: Indices = self.comm.bcast(on_root(self.comm, cells))
-        return of_body + self.cages.grids.first(number)
+        keys: Indices = self.comm.bcast(on_root(self.comm, cells))
+        return keys
 
     def _numbers(self, key: str, painted: str | tuple[int, ...]) -> list[int]:
         if not isinstance(painted, str):
@@ -263,6 +239,16 @@ class Finder:
                 f"{key}.region.painted: {path} must be a file of point numbers, from 0"
             )
         return numbers
+
+
+def _are_on(surface: Surface, points: Positions) -> Mask:
+    """Return which points (n, 3) [m] lie on a surface."""
+    import igl
+
+    squares = igl.point_mesh_squared_distance(points, surface.points, surface.triangles)[0]
+    low, high = bounds_of(surface)
+    on: Mask = squares <= (EDGE * (high - low).max()) ** 2
+    return on
 
 
 def groups_named(
@@ -303,34 +289,6 @@ def listed(names: Sequence[str]) -> str:
     )
 
 
-def probe_points(bodies: Sequence[BodySurface], probes: Sequence[Probe]) -> list[Sequence[float]]:
-    """Return the rest positions [m] of probes (collective).
-
-    The probe of a group is the group's point nearest to its centroid.
-
-    Raises InputError on all ranks if no body has a probe's group.
-    """
-    points: list[Sequence[float]] = []
-    for number, probe in enumerate(probes):
-        if probe.group is None:
-            assert probe.point is not None
-            points.append(probe.point)
-            continue
-        # A scene without regions and obstacles starts without igl.
-        import igl
-
-        group = next(iter(groups_named(bodies, f"output.probe.{number}", probe.group).values()))
-        corners = group.points[group.triangles]
-        areas = np.linalg.norm(
-            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-        )
-        middle = np.average(corners.mean(axis=1), axis=0, weights=areas)
-        points.append(
-            igl.point_mesh_squared_distance(middle[None], group.points, group.triangles)[2][0]
-        )
-    return points
-
-
 def _box_text(low: Floats, high: Floats) -> str:
     ends = (", ".join(f"{x:.4g}" for x in end) for end in (low, high))
     return "from ({}) to ({}) m".format(*ends)
@@ -350,42 +308,3 @@ def _extent(region: Region, bounds: Rows) -> str:
     normal = region.half_space.normal
     at, along = (", ".join(f"{x:.4g}" for x in vector) for vector in (point, normal))
     return f"beyond ({at}) m towards ({along})"
-
-
-class ProbePoints:
-    """Points of bodies, interpolated trilinearly from the corners of their cells."""
-
-    def __init__(self, comm: MPI.Comm, lattice: Lattice, points: Sequence[Sequence[float]]):
-        """Locate points by their rest positions (w, 3) [m] (collective).
-
-        Raises InputError on all ranks if a point is in no cell.
-        """
-        self.comm = comm
-        cells = to_host(lattice.local_cells)[: lattice.cells_owned]
-        low, numbers = to_host(lattice.nodes)[cells[:, 0]], lattice.global_numbers[cells[:, 0]]
-        self.corners = np.zeros((len(points), 8), np.int64)
-        self.weights = np.zeros((len(points), 8))
-        for row, point in enumerate(points):
-            place = (np.array(point) - low) / lattice.cell_size
-            around = np.flatnonzero(((place >= -ON_FACE) & (place <= 1 + ON_FACE)).all(axis=1))
-            own = int(numbers[around].min(initial=lattice.table.total))
-            # A point on a face or in overlapping bodies has several cells.
-            first = comm.allreduce(own, MPI.MIN)
-            if first == lattice.table.total:
-                place_text = ", ".join(f"{x:g}" for x in point)
-                raise InputError(
-                    f"output.probe.{row}.point: ({place_text}) m "
-                    "lies in no cell of the body at rest"
-                )
-            if own == first:
-                cell = around[np.argmin(numbers[around])]
-                self.corners[row] = cells[cell]
-                self.weights[row] = np.where(CORNERS == 1, place[cell], 1 - place[cell]).prod(
-                    axis=1
-                )
-
-    def __call__(self, q: Positions) -> Rows:
-        """Return the positions (w, 3) [m] of the points for nodes at q (l, 3) [m] (collective)."""
-        own = (self.weights[:, :, None] * to_host(q)[self.corners]).sum(axis=1)
-        places: Rows = self.comm.allreduce(own)
-        return places

@@ -21,7 +21,6 @@ from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.fields import FRAME_FIELDS, STRESS, Frame
 from msmpetsc.lattice.embedded_surface import EmbeddedPoints
-from msmpetsc.lattice.region import ProbePoints, probe_points
 from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.schema import Solver, holders_of
 from msmpetsc.scene.time import Time
@@ -129,9 +128,6 @@ class TimeLoop:
         self.steps, self.every = scene.time.steps, scene.output.every
         self.step = 0
         self.stored, self.stored_until = scene.stored, scene.stored_until
-        points = probe_points(model.bodies, scene.output.probe)
-        # ProbePoints may raise: it comes before the first PETSc object.
-        self.probe = ProbePoints(comm, model.lattice, points) if points else None
         self.environment = Environment(model)
         self.elasticity = self.environment.elasticity
         swings = scene.time.integrator != "implicit-euler"
@@ -304,7 +300,7 @@ class TimeLoop:
             self_contact=energies.touch.energy,
             time_error=step.time_error if step else np.nan,
             **vars(work),
-            probe=self.probe(q) if self.probe else None,
+            probe=self.model.probe(q) if self.model.probe else None,
             **self.forces(q, time, self.state.sides, step),
             **(self.stress(q) if self.stress else {}),
         )
@@ -313,8 +309,8 @@ class TimeLoop:
     def rows(self) -> dict[str, int]:
         """Return the number of this rank's rows of each optional field of a frame."""
         lattice, rows = self.model.lattice, dict(self.forces.rows)
-        if self.probe:
-            rows["probe"] = len(self.probe.corners)
+        if self.model.probe:
+            rows["probe"] = len(self.model.probe.corners)
         if self.surface:
             rows["surface"] = self.surface.weights.shape[0]
         if self.stress:

@@ -186,9 +186,6 @@ def test_no_two_bodies_have_a_node_in_common_and_one_follows_the_other():
         ijk = nodes + several.first(number)
         assert (several.body_of(ijk) == number).all()
         np.testing.assert_array_equal(several.node_positions(ijk), nodes.astype(float))
-        np.testing.assert_array_equal(
-            several.nearest_nodes(nodes.astype(float), np.full(len(nodes), number)), ijk
-        )
         keys.append(encode_morton(ijk))
         np.testing.assert_array_equal(np.argsort(keys[-1]), np.argsort(encode_morton(nodes)))
     for before, after in pairwise(keys):

@@ -12,9 +12,9 @@ import trimesh
 from strains import uniform_strains
 from surfaces import body_of
 
-from msmpetsc.build import nearest_of_body
 from msmpetsc.geometry.cages import fill
 from msmpetsc.lattice.cut_cells import CORNERS, mass_fractions, spring_fractions
+from msmpetsc.lattice.nearest_points import nearest_of_body
 from msmpetsc.lattice.topology import topology_of
 
 DENSITY = study.DENSITY
@@ -91,7 +91,9 @@ def test_nodes_stick_out_of_a_ball_by_their_distance_and_meet_a_plane_when_it_do
     body = body_of(BALL)
     cages = fill([body], 0.2)
     nodes = cages.grids.node_positions(topology_of(cages).ijk)
-    outside = np.linalg.norm(nodes - nearest_of_body([body], cages, topology_of(cages)), axis=1)
+    outside = np.linalg.norm(
+        nodes - nearest_of_body([body], cages, topology_of(cages)).points, axis=1
+    )
     np.testing.assert_allclose(outside, np.maximum(np.linalg.norm(nodes, axis=1) - 1, 0), atol=2e-3)
     for normal in np.random.default_rng(0).standard_normal((50, 3)):
         normal /= np.linalg.norm(normal)

@@ -17,7 +17,7 @@ from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.surface import Surface, examine
-from msmpetsc.lattice.region import probe_points
+from msmpetsc.lattice.probes import probe_points
 from msmpetsc.scene.schema import Probe
 
 LEFT = {"box": [[-1, -1, -1], [1e-3, 1, 1]]}

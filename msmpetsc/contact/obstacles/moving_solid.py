@@ -35,7 +35,7 @@ class Obstacle(Timed):
     solid   : the solid in its pose at time 0
     path    : motion of the solid
     key     : key of its table in the scene, for messages
-    outside : (l,) distance of nodes outside of the surface at rest [m] (build.nearest_of_body),
+    outside : (l,) distance of nodes outside of the surface at rest [m] (lattice.nearest_points),
               which is subtracted from their depth; None if the nodes are the surface
     """
 

@@ -236,7 +236,8 @@ def test_commands_run(path: Path, clone: Path):
 @pytest.mark.parametrize("path", WITH_PYTHON, ids=name_of)
 def test_python_runs(path: Path, tmp_path: Path):
     (tmp_path / "out").mkdir()
-    small_result.write(tmp_path / "out" / "bunny_fall.h5")
+    for name in ("bunny_fall", "coarse"):
+        small_result.write(tmp_path / "out" / f"{name}.h5")
     write_own_scene(tmp_path)
     for block in blocks(path, "python"):
         done = python("-c", block, cwd=tmp_path)

@@ -77,10 +77,11 @@ class Result:
 
     def region(self, table) -> np.ndarray:
         """Nodes of a pin's, anchor's or force's region: those that are inside, or where the body is
-        nearest to them."""
+        nearest to them. Nodes at slits, which share their place, are left out."""
         distance, _, nearest, _ = igl.signed_distance(self.nodes, *self.body)
         places = np.where(distance[:, None] > 0, nearest, self.nodes)
-        return inside(table.region, places, self.bounds)
+        _, place, count = np.unique(self.nodes, axis=0, return_inverse=True, return_counts=True)
+        return inside(table.region, places, self.bounds) & (count[place.ravel()] == 1)
 
     def mean(self, x: np.ndarray, where: np.ndarray) -> np.ndarray:
         """Mean by mass over some nodes of (..., n, 3)."""

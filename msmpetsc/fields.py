@@ -4,7 +4,7 @@ The writer, the reader's checks, xarray's names, study columns and the documenta
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, NamedTuple, get_type_hints
 
 import numpy as np
@@ -152,6 +152,10 @@ class Frame:
     cell_strain_energy: Annotated[
         Floats | None, _of_cells("J/m^3", "elastic energy of a cell per volume at rest")
     ] = None
+
+    def with_own_positions(self) -> "Frame":
+        """Return the frame with a copy of the positions, which the next step still needs."""
+        return replace(self, position=self.position.copy())
 
     def __repr__(self) -> str:
         """Return step, time and solver figures in a line, without the arrays."""

@@ -4,7 +4,7 @@ import logging
 import shlex
 from collections.abc import Callable, Mapping
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -130,10 +130,7 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> tuple[Checkpoints, Cost, S
                 with closing(Progress(simulation.steps, is_shown)) as progress:
                     observers: list[Callable[[Frame], object]] = [cost.count, progress.update]
                     if on_frame := plan.request.on_frame:
-                        # the next step still needs the frame's own positions
-                        observers.append(
-                            lambda frame: on_frame(replace(frame, position=frame.position.copy()))
-                        )
+                        observers.append(lambda frame: on_frame(frame.with_own_positions()))
                     signals.begin(file.abandon)
                     for frame in checkpoints.steps():
                         with cost.of_output():

@@ -261,8 +261,7 @@ class Simulation:
                     frame = next(steps, None)
                 if frame is None:
                     return
-                # the next step still needs the frame's own positions
-                yield replace(frame, position=frame.position.copy())
+                yield frame.with_own_positions()
 
     def _begin(self, scene: Scene, resources: ExitStack) -> Iterator[Frame]:
         """Build the model, reusing the geometry if it fits, and return the steps (collective)."""

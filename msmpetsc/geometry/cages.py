@@ -15,12 +15,13 @@ from mpi4py import MPI
 from msmpetsc.backend.arrays import Array, Indices, Rows
 from msmpetsc.comm import Route, log, on_root, together
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.cell_parts import CellParts, PartsOfPoints, parts_of, ranges
+from msmpetsc.geometry.cell_parts import CellParts, parts_of
 from msmpetsc.geometry.copies import NO_COPIES, Copies, find_copies
 from msmpetsc.geometry.fill_fractions import LEAK, OUTSIDE, Columns, sampled_inside
 from msmpetsc.geometry.grid import CHUNK, BodyGrids, Grid, packed, unpacked
 from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
-from msmpetsc.geometry.partition import SortedKeys
+from msmpetsc.geometry.partition import SortedKeys, ranges
+from msmpetsc.geometry.parts_of_points import PartsOfPoints
 from msmpetsc.geometry.surface import Surface, SurfaceReport, is_inside
 from msmpetsc.geometry.thickness import Thickness
 from msmpetsc.geometry.valid_cells import (

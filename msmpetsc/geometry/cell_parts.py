@@ -31,7 +31,8 @@ from msmpetsc.backend.arrays import Array, Indices, Mask, Rows
 from msmpetsc.geometry.grid import Grid, packed, unpacked
 from msmpetsc.geometry.lines_in_cells import LINES, split_cell
 from msmpetsc.geometry.morton import COPIES
-from msmpetsc.geometry.partition import places_of
+from msmpetsc.geometry.partition import places_of, ranges, rows_of
+from msmpetsc.geometry.parts_of_points import PartsOfPoints
 from msmpetsc.geometry.surface import Surface, first_of_equal, is_inside
 from msmpetsc.geometry.valid_cells import touched_cells
 
@@ -51,71 +52,6 @@ class Links(NamedTuple):
     high: Indices
     axis: Indices
     part: Indices
-
-
-@dataclass(frozen=True)
-class PartsOfPoints:
-    """Finder of the part of a cell that holds a point on or near the surface.
-
-    surface  : the body's surface
-    keys     : (s,) packed grid indices of the cells with several parts, and of cells separated from
-               a neighbour, ascending
-    cell     : (r,) number of the cell of each row, ascending
-    triangle : (r,) triangle in the cell
-    part     : (r,) part that the triangle bounds
-    """
-
-    surface: Surface
-    keys: Indices
-    cell: Indices
-    triangle: Indices
-    part: Indices
-
-    def find(self, points: Rows, ijk: Indices) -> Indices:
-        """Return the part (n,) that holds each point (n, 3) [m] in its cell (n, 3).
-
-        It is the part that the nearest of the cell's triangles bounds.
-        """
-        import igl
-
-        cell = places_of(self.keys, packed(ijk))
-        part = np.zeros(len(points), np.int64)
-        # a cell of a single part has part 0
-        for number in np.intersect1d(cell, self.cell[self.part > 0]):
-            own = cell == number
-            rows = slice(*np.searchsorted(self.cell, [number, number + 1]))
-            triangles = self.surface.triangles[self.triangle[rows]]
-            nearest = igl.point_mesh_squared_distance(points[own], self.surface.points, triangles)
-            part[own] = self.part[rows][nearest[1]]
-        return part
-
-    def nearest(self, points: Rows, ijk: Indices, part: Indices) -> Rows:
-        """Return the nearest points (n, 3) [m] of the parts around nodes at points (n, 3) [m].
-
-        A row is nan unless all of the node's parts are in cells of ``keys``.
-
-        ijk  : (n, 8, 3) cells around each node
-        part : (n, 8) part of which the node is a corner in each cell, -1 if there is none
-        """
-        import igl
-
-        nearest = np.full(points.shape, np.nan)
-        cell = np.where(part >= 0, places_of(self.keys, packed(ijk)), -1)
-        rows = np.flatnonzero(((cell >= 0) == (part >= 0)).all(axis=1) & (cell >= 0).any(axis=1))
-        of_cell = np.full(len(self.keys), -1)
-        for row, is_in in zip(rows, is_inside(self.surface, points[rows]), strict=True):
-            held = cell[row] >= 0
-            of_cell[cell[row, held]] = part[row, held]
-            around = _rows_of(self.cell, np.unique(cell[row, held]))
-            is_own = self.part[around] == of_cell[self.cell[around]]
-            triangles = self.surface.triangles[self.triangle[around]]
-            given = points[row : row + 1], self.surface.points
-            # a node within the body is in the part whose boundary is nearest
-            if is_in and is_own[igl.point_mesh_squared_distance(*given, triangles)[1]]:
-                nearest[row] = points[row]
-            elif is_own.any():
-                nearest[row] = igl.point_mesh_squared_distance(*given, triangles[is_own])[2]
-        return nearest
 
 
 @dataclass(frozen=True)
@@ -168,7 +104,7 @@ def parts_of(surface: Surface, grid: Grid, axes: Indices, volume: float) -> Cell
     cell, triangle = codes // size, codes % size
     piece, pieces = _pieces(cell, len(keys), ends[:, flush[ends[0]] == flush[ends[1]]])
     several = np.flatnonzero(pieces > 1)
-    own, first_piece = _rows_of(cell, several), np.cumsum(pieces) - pieces
+    own, first_piece = rows_of(cell, several), np.cumsum(pieces) - pieces
     begin = np.searchsorted(cell[own], np.append(several, len(keys)))
 
     ijk = unpacked(keys[several])
@@ -185,7 +121,7 @@ def parts_of(surface: Surface, grid: Grid, axes: Indices, volume: float) -> Cell
     crossing = _crossing_rows(codes, keys, size, flush, ends)
     links, separated = _links(surface, grid, keys, cell, part, crossing, sides)
     kept = np.flatnonzero((count > 1) | separated)
-    own = _rows_of(cell, kept)
+    own = rows_of(cell, kept)
     # a triangle in the low face of a cell of a single part bounds the body below
     own = own[(part[own] >= 0) & ((count[cell[own]] > 1) | (flush[own] == 0))]
     points = PartsOfPoints(
@@ -228,18 +164,6 @@ def _rows_in_cells(
     number = np.append(np.argsort(order), -1)[places_of(cycled, in_cell)]
     ends = _ends_of_edges(codes, size, number, one, other)
     return keys, codes, flush, ends, corners
-
-
-def ranges(first: Indices, length: Indices) -> Indices:
-    """Return the concatenated ranges first[i] .. first[i] + length[i] - 1."""
-    begin = np.cumsum(length) - length
-    return np.arange(length.sum()) - np.repeat(begin - first, length)
-
-
-def _rows_of(cell: Indices, wanted: Indices) -> Indices:
-    """Return the rows of ``cell`` (r,), ascending, that name a wanted cell."""
-    first = np.searchsorted(cell, wanted)
-    return ranges(first, np.searchsorted(cell, wanted, side="right") - first)
 
 
 def _edges_in_cells(

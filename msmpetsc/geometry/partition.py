@@ -27,6 +27,18 @@ def places_of(keys: Indices, wanted: Indices) -> Indices:
     return np.where(keys[place] == wanted, place, -1)
 
 
+def ranges(first: Indices, length: Indices) -> Indices:
+    """Return the concatenated ranges first[i] .. first[i] + length[i] - 1."""
+    begin = np.cumsum(length) - length
+    return np.arange(length.sum()) - np.repeat(begin - first, length)
+
+
+def rows_of(keys: Indices, wanted: Indices) -> Indices:
+    """Return the rows of ascending ``keys`` (r,) that are a wanted key."""
+    first = np.searchsorted(keys, wanted)
+    return ranges(first, np.searchsorted(keys, wanted, side="right") - first)
+
+
 class SortedKeys:
     """Distinct int64 keys sorted over all ranks; a key's position is its global index.
 

@@ -1,12 +1,13 @@
 """Surfaces of barrier obstacles: triangles that move and turn as the scene says."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 import trimesh
 
-from msmpetsc.backend.arrays import Positions, Rows
+from msmpetsc.backend.arrays import Floats, Positions, Rows
 from msmpetsc.contact.obstacles.distance import DistanceSolid
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.geometry.surface import Surface
@@ -61,10 +62,12 @@ class ObstacleSurfaces:
         return self._on_path(time)
 
     def _on_path(self, time: float) -> Positions:
-        paths = zip((obstacle.path for obstacle in self.obstacles), self.solids, strict=True)
-        return np.concatenate(
-            [path.moved(solid.points, path.value_at(time)) for path, solid in paths]
-        )
+        return self._posed([obstacle.path.value_at(time) for obstacle in self.obstacles])
+
+    def _posed(self, poses: Sequence[Floats]) -> Positions:
+        """Return the points (o, 3) [m] with each obstacle in a pose of its path."""
+        posed = zip(self.obstacles, self.solids, poses, strict=True)
+        return np.concatenate([each.path.moved(solid.points, pose) for each, solid, pose in posed])
 
     def displacements(self, begin: float, end: float) -> Rows:
         """Return displacements (o, 3) [m] of the points between two times [s].
@@ -82,12 +85,9 @@ class ObstacleSurfaces:
 
         Paths go back from begin as straight as they go to end [s]: a kink at begin does not count.
         """
-        at_begin, before = [], []
-        for path, solid in zip((o.path for o in self.obstacles), self.solids, strict=True):
-            pose = path.value_at(begin)
-            at_begin.append(path.moved(solid.points, pose))
-            before.append(path.moved(solid.points, 2 * pose - path.value_at(end)))
-        return np.concatenate(at_begin) - np.concatenate(before)
+        poses = [(o.path.value_at(begin), o.path.value_at(end)) for o in self.obstacles]
+        before = [2 * at_begin - at_end for at_begin, at_end in poses]
+        return self._posed([at_begin for at_begin, _ in poses]) - self._posed(before)
 
     def sums(self, forces: Rows) -> Rows:
         """Return the total force (k, 3) [N] on each obstacle, by forces (o, 3) [N] on points."""

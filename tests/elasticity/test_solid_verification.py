@@ -1,12 +1,9 @@
 """The neo-Hookean solid in runs of scenes, against theory (tables: scripts/results/solid.md)."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 import small_strain
 import solid_runs as study
-from scipy.optimize import brentq
 from skfem.models.elasticity import lame_parameters
 
 from msmpetsc.elasticity.energy import Elasticity
@@ -58,23 +55,11 @@ def textbook(F: np.ndarray, poisson: float) -> np.ndarray:
     return mu * (F - inverse) + lame * (J - 1) * J * inverse
 
 
-def stretched(poisson: float, s: float, sides: int) -> np.ndarray:
-    """Return the deformation gradient of stretches s along all axes but the last so many, whose
-    faces are free."""
-
-    def shape(free: float) -> np.ndarray:
-        return np.diag([*(3 - sides) * [s], *sides * [free]])
-
-    return shape(brentq(lambda free: textbook(shape(free), poisson)[2, 2], 0.1, 10, xtol=1e-15))
-
-
-def strains(poisson: float) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield names and deformation gradients."""
-    for s in (0.5, 1.5):
-        yield f"uniaxial, {s}", stretched(poisson, s, 2)
-        yield f"equibiaxial, {s}", stretched(poisson, s, 1)
-        yield f"shear, {s}", np.array([[1, s, 0], [0, 1, 0], [0, 0, 1.0]])
-    yield "confined, 0.7", np.diag([0.7, 1, 1])
+STRAINS = [
+    F
+    for s in (0.5, 1.5)
+    for F in (np.diag([s, 1, 1]), np.diag([s, s, 1]), np.array([[1, s, 0], [0, 1, 0], [0, 0, 1]]))
+]
 
 
 @pytest.mark.parametrize("poisson", study.POISSON)
@@ -83,7 +68,7 @@ def test_the_forces_are_the_textbooks(poisson: float):
     h, cells = 0.125, (4, 3, 2)
     lattice = small_strain.box(cells, h, poisson)
     sides = h * np.array(cells)
-    for name, F in strains(poisson):
+    for F in STRAINS:
         force, exact = np.zeros((2, *lattice.nodes.shape))
         Elasticity(lattice).add_gradient(lattice.nodes @ F.T, force)
         P = textbook(F, poisson)
@@ -93,4 +78,4 @@ def test_the_forces_are_the_textbooks(poisson: float):
             for sign, at in ((-1, 0), (1, sides[axis])):
                 on = np.isclose(lattice.nodes[:, axis], at)
                 exact[on] += sign * h**2 * part[on, None] * P[:, axis]
-        assert np.abs(force - exact).max() < 1e-11 * np.abs(exact).max(), name
+        assert np.abs(force - exact).max() < 1e-11 * np.abs(exact).max(), F

@@ -5,14 +5,12 @@ directories, and lets two processes mix up their files.
 
 - The name of a directory has a digest of all sources with kernels.
 - The name of a file is a digest of the kernel, its argument types and the constants that it reads.
-- The files are executable code, so a directory is read only if no other user may write to it.
 """
 
 import hashlib
 import inspect
 import os
 import pickle
-import stat
 import sys
 import tempfile
 import uuid
@@ -51,10 +49,7 @@ SOURCES = _digest_of_sources()
 
 
 def _candidates() -> Iterator[Path]:
-    """Yield the candidates for the cache directory, by preference.
-
-    They are in the user's choice, the package, the home directory and the temporary directory.
-    """
+    """Yield the candidates for the cache directory: the user's choice, the package, home."""
     own = f"msmpetsc-kernels-{os.getuid()}-{SOURCES}"
     if chosen := os.environ.get("NUMBA_CACHE_DIR"):
         yield Path(chosen) / own
@@ -62,34 +57,20 @@ def _candidates() -> Iterator[Path]:
     # Path.home() raises RuntimeError for a user without a home directory.
     with suppress(RuntimeError):
         yield Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / own
-    with suppress(FileNotFoundError):
-        yield Path(tempfile.gettempdir()) / own
-
-
-def _is_safe(folder: Path) -> bool:
-    """Return whether only this user, root or the package's owner may write to a directory."""
-    status = folder.lstat()
-    is_ours = status.st_uid in (os.getuid(), 0, PACKAGE.stat().st_uid)
-    return (
-        stat.S_ISDIR(status.st_mode)
-        and is_ours
-        and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-    )
 
 
 @cache
 def folders() -> tuple[list[Path], Path | None]:
     """Return the cache directories to read, and the directory to write; None if there is none."""
-    safe = []
+    readable = []
     for folder in map(Path.absolute, _candidates()):
         with suppress(OSError):
             folder.mkdir(0o755, parents=True, exist_ok=True)
-            if _is_safe(folder):
-                safe.append(folder)
-                with tempfile.TemporaryFile(dir=folder) as file:
-                    file.write(bytes(PROBE))
-                return safe, folder
-    return safe, None
+            readable.append(folder)
+            with tempfile.TemporaryFile(dir=folder) as file:
+                file.write(bytes(PROBE))
+            return readable, folder
+    return readable, None
 
 
 def writable() -> Path | None:

@@ -61,7 +61,7 @@ def chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def environment(package: Path, **variables: object) -> dict[str, str]:
-    """Return variables that keep kernels only in the folders named here, or in /tmp."""
+    """Return variables that keep kernels only in the folders named here."""
     given = {"HOME": NOWHERE, "PYTHONPATH": str(package.parent), **variables}
     others = {
         name: x
@@ -79,7 +79,7 @@ def called(package: Path, **variables: object) -> tuple[float, int]:
     return float(value), int(found)
 
 
-@pytest.mark.parametrize("name", ["NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME", "TMPDIR"])
+@pytest.mark.parametrize("name", ["NUMBA_CACHE_DIR", "XDG_CACHE_HOME", "HOME"])
 def test_kernels_are_found_again_wherever_they_can_be_kept(copied: Path, tmp_path: Path, name: str):
     (tmp_path / "here").mkdir()
     assert [called(copied, **{name: tmp_path / "here"}) for _ in range(2)] == [(8.0, 0), (8.0, 1)]
@@ -141,6 +141,9 @@ def test_a_kernel_that_is_damaged_on_the_disk_is_compiled_anew(copied: Path, tmp
 
 
 def test_a_disk_that_is_full_keeps_nothing(chosen: Path):
+    kernel_cache.save("b", b"code")
+    assert kernel_cache.load("b") == b"code" and not kernel_cache.is_empty()
+    (stored,) = chosen.iterdir()
     _, most = resource.getrlimit(FILES)
     try:
         resource.setrlimit(FILES, (0, most))
@@ -149,26 +152,7 @@ def test_a_disk_that_is_full_keeps_nothing(chosen: Path):
         assert kernel_cache.writable() is None
     finally:
         resource.setrlimit(FILES, (most, most))
-    assert kernel_cache.load("a") is None and not any(chosen.iterdir())
-
-
-@pytest.mark.parametrize(
-    "kind", ["writable by all", "writable by a group", "a link", "of another user"]
-)
-def test_no_folder_is_read_that_somebody_else_may_write_to(chosen: Path, kind: str):
-    kernel_cache.save("a", b"code")
-    assert kernel_cache.load("a") == b"code" and not kernel_cache.is_empty()
-    if kind == "a link":
-        chosen.rename(chosen.parent / "other")
-        chosen.symlink_to("other")
-    elif kind == "of another user":
-        if os.getuid():
-            pytest.skip("only root can give a folder away")
-        os.chown(chosen, 12345, -1)
-    else:
-        chosen.chmod(0o777 if kind == "writable by all" else 0o775)
-    kernel_cache.folders.cache_clear()
-    assert chosen not in kernel_cache.folders()[0] and kernel_cache.load("a") is None
+    assert kernel_cache.load("a") is None and [*chosen.iterdir()] == [stored]
 
 
 def test_kernels_of_a_folder_that_cannot_be_written_are_found(copied: Path, tmp_path: Path):

@@ -76,13 +76,7 @@ def described(
     """
     size = np.dtype(dtype).itemsize
     by_row = tuple(np.cumprod((size, *shape[:0:-1]))[::-1])
-    by_column = tuple(np.cumprod((size, *shape[:-1])))
-    if strides == by_row or 0 in shape:
-        layout = "C"
-    elif strides == by_column:
-        layout = "F"
-    else:
-        layout = "A"
+    layout = "C" if strides == by_row or 0 in shape else "A"
     words = 0, 0, int(np.prod(shape)), size, pointer, *shape, *strides
     return f"{dtype} {len(shape)} {layout}", words
 

@@ -82,18 +82,13 @@ def _load(rows: Rows, row: int, w: Floats, at: int) -> None:
 
 
 @njit(fastmath=FAST, error_model="numpy")
-def _product_lanes(w: Floats) -> None:
+def _product_lanes(w: Floats, projected: bool) -> None:
     for lane in range(LANES):
         k, e = CONSTANTS + lane, _strains_in(w, lane)
-        slopes, modes = cell_product(w, k, w, AT_STATE + lane, e)
-        write_forces(w, RESULT + lane, form_of(w, k), slopes, modes)
-
-
-@njit(fastmath=FAST, error_model="numpy")
-def _projected_product_lanes(w: Floats) -> None:
-    for lane in range(LANES):
-        k, e = CONSTANTS + lane, _strains_in(w, lane)
-        slopes, modes = projected_product(w, k, w, AT_STATE + lane, e)
+        if projected:
+            slopes, modes = projected_product(w, k, w, AT_STATE + lane, e)
+        else:
+            slopes, modes = cell_product(w, k, w, AT_STATE + lane, e)
         write_forces(w, RESULT + lane, form_of(w, k), slopes, modes)
 
 
@@ -108,10 +103,7 @@ def add_product(blocks: CellBlocks, state: Rows, v: Rows, product: Rows) -> None
         _gather(blocks.nodes, b, v, w)
         _load(blocks.constants, blocks.which[b], w, CONSTANTS)
         _load(state, b, w, AT_STATE)
-        if projected:
-            _projected_product_lanes(w)
-        else:
-            _product_lanes(w)
+        _product_lanes(w, projected)
         _scatter(blocks.nodes, b, w, product)
 
 

@@ -3,7 +3,7 @@
 The three edges at a corner span the corner's volume. Positions are local, (l, 3) [m].
 """
 
-from typing import NamedTuple
+import math
 
 import numpy as np
 
@@ -13,40 +13,23 @@ from msmpetsc.elasticity.cell_strain import Six, strain
 from msmpetsc.elasticity.vectors import Vector, cross, dot, vector
 
 
-class Shapes(NamedTuple):
-    """Corner nodes (c, 8) of a solid's cells, and their forms (c, FORM) (lattice.cell_moments)."""
-
-    cells: Indices
-    forms: Rows
-
-
 @njit()
 def _volume(a: Vector, b: Vector, c: Vector) -> float:
     """Return a . (b x c)."""
     return dot(a, cross(b, c))
 
 
-@njit()
-def least_volume(q: Positions, c: Indices) -> float:
-    """Return the smallest of the eight corner volumes of a cell [m^3]."""
-    x0, x1 = vector(q, c[0], c[1]), vector(q, c[3], c[2])
-    x2, x3 = vector(q, c[4], c[5]), vector(q, c[7], c[6])
-    y0, y1 = vector(q, c[0], c[3]), vector(q, c[1], c[2])
-    y2, y3 = vector(q, c[4], c[7]), vector(q, c[5], c[6])
-    z0, z1 = vector(q, c[0], c[4]), vector(q, c[1], c[5])
-    z2, z3 = vector(q, c[2], c[6]), vector(q, c[3], c[7])
-    low = min(_volume(x0, y0, z0), _volume(x0, y1, z1), _volume(x1, y1, z2), _volume(x1, y0, z3))
-    v4, v5 = _volume(x2, y2, z0), _volume(x2, y3, z1)
-    v6, v7 = _volume(x3, y3, z2), _volume(x3, y2, z3)
-    return float(min(low, v4, v5, v6, v7))
-
-
 @kernel
 def _least_volume_of(
-    first: int, count: int, step: int, q: Positions, cells: Indices, least: Floats,
-) -> None:  # fmt: skip
+    first: int, count: int, step: int, q: Positions, cells: Indices, least: Floats
+) -> None:
     for i in range(first, count, step):
-        least[i] = least_volume(q, cells[i])
+        c, least[i] = cells[i], math.inf
+        for a in range(4):
+            b, d, e = (a + 1) % 4, (a + 3) % 4, a + 4
+            x, y, z = vector(q, c[a], c[b]), vector(q, c[a], c[d]), vector(q, c[a], c[e])
+            u, v, w = vector(q, c[e], c[d + 4]), vector(q, c[e], c[b + 4]), vector(q, c[e], c[a])
+            least[i] = min(least[i], _volume(x, y, z), _volume(u, v, w))
 
 
 def least_volumes(q: Positions, cells: Indices) -> Floats:
@@ -68,9 +51,8 @@ def _mean_slope(q: Positions, c: Indices, k: int, form: Six) -> Vector:
 
 @kernel
 def _mean_volume_of(
-    first: int, count: int, step: int, volumes: Floats, q: Positions, shapes: Shapes
+    first: int, count: int, step: int, volumes: Floats, q: Positions, cells: Indices, forms: Rows
 ) -> None:
-    cells, forms = shapes
     for i in range(first, count, step):
         f, c = forms[i], cells[i]
         form = f[0], f[1], f[2], f[3], f[4], f[5]
@@ -80,7 +62,10 @@ def _mean_volume_of(
 
 
 def volume_ratios(q: Positions, cells: Indices, forms: Rows, cell_size: float) -> Floats:
-    """Return J (c,) [-] of a solid's cells at q (l, 3) [m], of the mean deformation gradient."""
+    """Return J (c,) [-] of a solid's cells at q (l, 3) [m], of the mean deformation gradient.
+
+    cells, forms : (c, 8) corner nodes; (c, FORM) of lattice.cell_moments
+    """
     volumes: Floats = np.empty(len(cells), like=q)
-    _mean_volume_of(len(cells), volumes, q, Shapes(cells, forms))
+    _mean_volume_of(len(cells), volumes, q, cells, forms)
     return volumes / (4.0 * cell_size) ** 3

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from lattices import dense_hessian
 from scipy.spatial.transform import Rotation
-from test_neo_hookean import RNG, YOUNG, H, cases, gradient, moments, points_inside, solid
+from test_neo_hookean import RNG, YOUNG, H, cases, gradient, kinds, moments, points_inside, solid
 
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.geometry.grid import CORNERS
@@ -13,11 +13,15 @@ from msmpetsc.lattice.cell_moments import bounding_laplacians, forms_of, laplaci
 from msmpetsc.lattice.lattice import Lattice, SolidCells
 
 
-@cases
-def test_a_rotation_turns_the_gradient_and_costs_nothing(poisson: float, cut: bool):
-    lattice = solid(3, 2, 2, poisson=poisson, cut=cut)
+@kinds
+def test_a_rotation_turns_the_gradient_and_costs_nothing(poisson: float, cut: bool, volume: str):
+    lattice = solid(3, 2, 2, poisson=poisson, cut=cut, volume=volume)
     elastic = Elasticity(lattice)
     turn = Rotation.from_rotvec([0.7, -2.0, 1.1])
+    turned = turn.apply(lattice.nodes) + np.array([3, 2, 1])
+    for q in (lattice.nodes, turned):
+        assert np.abs(gradient(elastic, q)).max() < 1e-12 * YOUNG * H
+        assert abs(elastic.energy(q)) < 1e-12 * YOUNG * H**3
     for strain in (0.1, 0.8):
         q = lattice.nodes + strain * H * RNG.standard_normal(lattice.nodes.shape)
         turned = turn.apply(q)

@@ -18,7 +18,6 @@ from msmpetsc.elasticity.solid import NeoHookean
 from msmpetsc.elasticity.viscosity import Viscosity
 from msmpetsc.lattice.cell_moments import SIGNS, forms_of, laplacians, slopes_and_modes
 from msmpetsc.lattice.lattice import Lattice, build_lattice
-from msmpetsc.lattice.mass_and_stiffness import SolidCells
 from msmpetsc.lattice.material import lame_constants
 from msmpetsc.scene.body import Material
 
@@ -177,16 +176,6 @@ def test_energy_changes_by_what_it_was_and_small_changes_keep_their_digits(
 
 
 @kinds
-def test_rest_is_free_of_stress_and_turning_costs_nothing(poisson: float, cut: bool, volume: str):
-    lattice = solid(3, 3, 2, poisson=poisson, cut=cut, volume=volume)
-    elastic = Elasticity(lattice)
-    turned = Rotation.from_rotvec([1.0, -2.0, 0.5]).apply(lattice.nodes) + np.array([3, 2, 1])
-    for q in (lattice.nodes, turned):
-        assert np.abs(gradient(elastic, q)).max() < 1e-12 * YOUNG * H
-        assert abs(elastic.energy(q)) < 1e-12 * YOUNG * H**3
-
-
-@kinds
 def test_projected_hessian_is_semidefinite_and_the_other_no_less_than_minus_its_concavity(
     poisson: float, cut: bool, volume: str
 ):
@@ -217,7 +206,7 @@ def test_projected_hessian_is_semidefinite_and_the_other_no_less_than_minus_its_
 
 
 def test_ten_thousand_cut_cells_are_semidefinite_at_rest():
-    """mu |grad|^2 and the second variation of each cell. F sees the strain of the integral."""
+    """The Laplacian of each cell, also less the square of the mean slope (Jensen)."""
     count, n = 10_000, 60
     fills, second = map(
         np.array, zip(*(moments(points_inside(RNG, n), n) for _ in range(count)), strict=True)
@@ -231,15 +220,6 @@ def test_ten_thousand_cut_cells_are_semidefinite_at_rest():
         k - (volume / 16)[:, None, None] * slopes.transpose(0, 2, 1) @ slopes
     )[:, 0]
     assert (jensen / np.trace(k, axis1=1, axis2=2)).min() > -1e-14
-    for shear, lame in ((1.0, 0.0), (1.0, 49.0)):
-        lattice = solid(1, 1, 1, poisson=0.25)
-        for i in range(0, count, 250):
-            cells = SolidCells(
-                forms[i : i + 1], volume[i : i + 1] * H**3, np.array([shear]), np.array([lame])
-            )
-            one = Elasticity(Lattice(**(vars(lattice) | {"solid": cells})))
-            h = dense_hessian(one, lattice.nodes)
-            assert np.linalg.eigvalsh(h).min() > -1e-13 * np.abs(h).max()
 
 
 def test_whole_cells_have_springs_on_face_and_space_diagonals_alone():
@@ -295,16 +275,6 @@ def test_uniform_strain_has_the_energy_and_the_forces_of_its_law(volume: str):
         np.testing.assert_allclose(
             gradient(elastic, lattice.nodes @ f.T), forces, atol=1e-12 * np.abs(forces).max()
         )
-
-
-@volumes
-def test_volumetric_energies_agree_at_small_strain_alone(volume: str):
-    quadratic, other = (solid(2, 1, 1, poisson=0.45, volume=name) for name in ("quadratic", volume))
-    at_rest, moved = quadratic.nodes, 1.1 * quadratic.nodes
-    hessians = [dense_hessian(Elasticity(lattice), at_rest) for lattice in (quadratic, other)]
-    np.testing.assert_allclose(*hessians, atol=1e-12 * np.abs(hessians[0]).max())
-    energies = [Elasticity(lattice).energy(moved) for lattice in (quadratic, other)]
-    assert (abs(energies[1] / energies[0] - 1) > 0.05) == (volume != "quadratic")
 
 
 @volumes

@@ -72,10 +72,8 @@ ONSET = 0.2
 CONVEX = 0.5
 # R, bound of the norm of G -> F x G by |F| [-]; see above
 NORM = math.sqrt(4 / 3)
-# iterations towards a cell's rotation [-]; Newton's method converges from any J > 0
+# iterations towards a cell's rotation [-]; far from it each halves the largest stretch
 ROTATION_ITERATIONS = 30
-# norm of a step of this iteration at which it ends [-]; close to rounding
-ROTATION_TOLERANCE = 1e-12
 
 
 @njit(inline="always")
@@ -175,19 +173,8 @@ def kept_modes(state: Floats, s: int) -> Three:
 
 
 @njit(inline="always")
-def slope_gradient(e: Strains, m: float, lame: float, h4: float, u: int) -> Three:
-    """Return the derivative of E with respect to 4 h times the mean slopes."""
-    g, inverse_h4 = slopes_of(e), 1.0 / h4
-    n = cofactors(g)
-    j = dot(g[0], n[0]) * (inverse_h4 * inverse_h4 * inverse_h4)
-    return total(times(m, g), times(inverse_h4 * _slopes(j, m, lame, u)[0], n))
-
-
-@njit(inline="always")
 def slope_product(e: Strains, m: float, state: Floats, s: int) -> Three:
     """Return the product of the Hessian of E with a displacement, by the mean slopes.
-
-    It is the derivative of ``slope_gradient``, in terms of 4 h times the mean slopes.
 
     e        : strains of the displacement
     m        : V mu / (16 h^2)
@@ -213,8 +200,11 @@ def cell_gradient(
     e       : strains of positions
     u       : number of the volumetric energy
     """
-    slopes = slope_gradient(e, m, lame, h4, u)
-    turning, modes = rest_gradient(rest, gradient_of(e, 1.0 / h4), e, 1.0 / h4)
+    g, inverse_h4 = slopes_of(e), 1.0 / h4
+    n = cofactors(g)
+    j = dot(g[0], n[0]) * (inverse_h4 * inverse_h4 * inverse_h4)
+    slopes = total(times(m, g), times(inverse_h4 * _slopes(j, m, lame, u)[0], n))
+    turning, modes = rest_gradient(rest, gradient_of(e, inverse_h4), e, inverse_h4)
     return total(slopes, turning), modes
 
 
@@ -316,10 +306,7 @@ def rotation_of(f: Three) -> tuple[Three, bool]:
         return ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), False
     for _ in range(ROTATION_ITERATIONS):
         n = cofactors(f)
-        step = total(times(-0.5, f), times(0.5 / dot(f[0], n[0]), n))
-        f = total(f, step)
-        if not inner(step, step) > ROTATION_TOLERANCE * ROTATION_TOLERANCE:
-            break
+        f = total(times(0.5, f), times(0.5 / dot(f[0], n[0]), n))
     return f, True
 
 

@@ -17,8 +17,8 @@ from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.elasticity.cell_blocks import PROJECTED, ROWS, CellRows, one_by_one
 from msmpetsc.elasticity.cell_strain import LANES
-from msmpetsc.elasticity.cell_threads import constants_at, gradient_at, state_at
-from msmpetsc.elasticity.neo_hookean import rotation_of, write_state
+from msmpetsc.elasticity.cell_threads import constants_at, state_at, strains_at
+from msmpetsc.elasticity.neo_hookean import gradient_of, rotation_of, write_state
 from msmpetsc.elasticity.solid import CellHessians, NeoHookean
 
 
@@ -30,7 +30,7 @@ def _turned_states(first: int, count: int, step: int, q: Positions, cells: CellR
     """
     for i in range(first, count, step):
         k = constants_at(cells, i)
-        r, has_rotation = rotation_of(gradient_at(q, cells, i))
+        r, has_rotation = rotation_of(gradient_of(strains_at(q, cells, i), 1.0 / cells.h4))
         m = cells.constants[k + 104]
         slope = -m if has_rotation else 0.0
         write_state(cells.state, state_at(cells, i), r, slope, m + cells.constants[k + 112])

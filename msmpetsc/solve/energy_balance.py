@@ -120,13 +120,7 @@ class EnergyBalance:
             given.pressures.change(q, lattice.nodes) - np.vdot(given.force, at),
             *(lattice.mass @ v),
         )
-        return Energies(
-            **dict(
-                zip(("kinetic", "free", "elastic", "contact", "potential"), sums[:5], strict=True)
-            ),
-            momentum=sums[5:],
-            touch=environment.touch(q, time),
-        )
+        return Energies(*sums[:5], momentum=sums[5:], touch=environment.touch(q, time))
 
     def examine(
         self, before: State, result: StepResult, after: State, time: float, time_step: float

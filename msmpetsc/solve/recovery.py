@@ -129,13 +129,14 @@ class Recovery:
                         "t = %.6g s: the step %s: it is %s", time, reason, WORDS[self.on_failure]
                     )
         self.recovered += 1
-        # Checkpoints do not hold the spare integrators.
-        for integrator in self.spare.values():
-            integrator.forget()
-        if self.on_failure == "fallback":
-            result, after = self._take(0, state, time)
-            return replace(result, cost=result.cost + Work(fallbacks=1)), after
-        return self._in_pieces(state, time)
+        try:
+            if self.on_failure == "fallback":
+                result, after = self._take(0, state, time)
+                return replace(result, cost=result.cost + Work(fallbacks=1)), after
+            return self._in_pieces(state, time)
+        finally:
+            # A resumed run starts without spare integrators.
+            self.destroy()
 
     def sum_up(self) -> None:
         """Log at the end of a run how many steps were recovered."""
@@ -156,8 +157,6 @@ class Recovery:
 
         pieces.run(take)
         self.level = pieces.level
-        # A resumed run starts without spare solvers.
-        self.destroy()
         return replace(result, cost=replace(cost, steps=1)), state
 
     def _take(self, level: int, state: State, time: float) -> tuple[StepResult, State]:
@@ -166,8 +165,6 @@ class Recovery:
         if level not in self.spare:
             self.spare[level] = self._new(short)
             self.spare[level].set_up()
-            # A new integrator must not differ from a kept integrator.
-            self.spare[level].forget()
         before = state.over(self.time_step, short)
         result, after = take_step(self.balance, self.spare[level], before, time)
         previous = State(result.position, result.previous).over(short, self.time_step).q_previous

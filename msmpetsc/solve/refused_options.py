@@ -12,7 +12,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.errors import InputError, did_you_mean
-from msmpetsc.solve.petsc.library import Integer, petsc_library
+from msmpetsc.solve.petsc.library import petsc_library
 from msmpetsc.solve.presets import MOST_ITERATIONS, PRESETS, in_use
 
 READ_AT_THE_END = re.compile(
@@ -116,8 +116,9 @@ def refuse_unused(comm: MPI.Comm, at_end: bool = False, awaited: tuple[str, ...]
     """
     unused = [
         name
-        for name in _unread_options()
+        for name in PETSc.Options().getAll()
         if not in_use[name]
+        and not _is_read(name)
         and not READ_AT_THE_END.search(name)
         and (at_end or not READ_WHILE_SOLVING.search(name))
         and not name.startswith(awaited)
@@ -136,19 +137,11 @@ def _refuse(comm: MPI.Comm, lines: Iterable[str]) -> None:
         raise InputError(message)
 
 
-def _unread_options() -> list[str]:
-    """Return the names of the options that nothing has read (PetscOptionsLeftGet)."""
-    library = petsc_library()
-    strings = ctypes.POINTER(ctypes.c_char_p)
-    count, names, values = Integer(), strings(), strings()
-    library.PetscOptionsLeftGet(
-        None, ctypes.byref(count), ctypes.byref(names), ctypes.byref(values)
-    )
-    unread = [names[i].decode() for i in range(count.value)]
-    library.PetscOptionsLeftRestore(
-        None, ctypes.byref(count), ctypes.byref(names), ctypes.byref(values)
-    )
-    return unread
+def _is_read(name: str) -> bool:
+    """Return whether an object has read an option (PetscOptionsUsed)."""
+    used = ctypes.c_int()
+    petsc_library().PetscOptionsUsed(None, name.encode(), ctypes.byref(used))
+    return bool(used)
 
 
 def silence_options_left() -> None:

@@ -135,21 +135,19 @@ class Monitors:
 
     work      : work of the steps since the frame stored before
     frames    : frames with inverted cells
-    now, most : inverted cells in the last frame, and their maximum over the frames
-    far       : frames with a step far from its solution; ``worst_error`` is the largest error
-    gaining   : steps with spurious energy; ``worst_gain`` is its largest share of all energy
+    far       : frames with a step far from its solution
+    gaining   : steps with spurious energy
     """
 
     state: ClassVar[dict[str, Range]] = {
-        **dict.fromkeys(("frames", "most", "now", "far", "gaining"), COUNT),
-        **dict.fromkeys(("worst_error", "worst_gain", "work"), ANY),
+        **dict.fromkeys(("frames", "far", "gaining"), COUNT),
+        "work": ANY,
     }
 
     def __init__(self, environment: Environment, time_step: float):
         self.environment, self.time_step, self.lattice = environment, time_step, environment.lattice
         self.comm = self.lattice.table.comm
-        self.frames = self.most = self.now = self.far = self.gaining = 0
-        self.worst_error = self.worst_gain = 0.0
+        self.frames = self.far = self.gaining = 0
         self.work = Work()
 
     def _warn(self, index: int, time: float, text: str) -> None:
@@ -157,16 +155,15 @@ class Monitors:
 
     def inverted(self, index: int, time: float, q: Positions) -> int:
         """Return the number of inverted cells at q (l, 3) [m]; warn of the first (collective)."""
-        self.now, worst = worst_inverted(self.comm, self.lattice, q)
-        if self.now and not self.frames:
+        count, worst = worst_inverted(self.comm, self.lattice, q)
+        if count and not self.frames:
             remedy = "a smaller time.step or a smaller solver.error helps to keep them as they were"
             if self.lattice.solid is None:
                 remedy = 'springs cannot turn them back, material.law = "neo-hookean" can'
-            are = "s are" if self.now > 1 else " is"
-            self._warn(index, time, f"{self.now} cell{are} inside out, the worst {worst}; {remedy}")
-        self.frames += self.now > 0
-        self.most = max(self.most, self.now)
-        return self.now
+            are = "s are" if count > 1 else " is"
+            self._warn(index, time, f"{count} cell{are} inside out, the worst {worst}; {remedy}")
+        self.frames += count > 0
+        return count
 
     def error(self, index: int, time: float) -> None:
         """Warn if the estimated error of a frame's steps is above FAR."""
@@ -182,7 +179,6 @@ class Monitors:
                 )
                 self._warn(index, time, f"its step ended {off}; {remedies}")
             self.far += 1
-            self.worst_error = max(self.worst_error, error)
 
     def overlaps(self, index: int, time: float, q: Positions) -> None:
         """Warn of nodes inside obstacles that begin to act in step ``index`` (collective).
@@ -209,24 +205,13 @@ class Monitors:
                 share = f"{100 * budget.share:.2g}% of all energy"
                 self._warn(index, time, f"{share}, {part}, came from nowhere; try {remedy}")
             self.gaining += 1
-            self.worst_gain = max(self.worst_gain, budget.share)
 
     def sum_up(self) -> None:
         """Log at the end of a run how often each kind of trouble occurred."""
-        if self.frames:
-            left = f"{self.now} still are" if self.now else "none is at the end"
-            log.warning(
-                "cells were inside out in %d frames, at most %d; %s", self.frames, self.most, left
-            )
-        if self.far:
-            log.warning(
-                "steps ended far off their solution in %d frames, by up to %.2g",
-                self.far,
-                self.worst_error,
-            )
-        if self.gaining:
-            log.warning(
-                "in %d frames there was energy from nowhere, up to %.2g%% of all",
-                self.gaining,
-                100 * self.worst_gain,
-            )
+        for count, trouble in (
+            (self.frames, "cells were inside out"),
+            (self.far, "steps ended far off their solution"),
+            (self.gaining, "there was energy from nowhere"),
+        ):
+            if count:
+                log.warning("%s in %d frames", trouble, count)

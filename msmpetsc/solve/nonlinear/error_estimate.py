@@ -9,14 +9,14 @@ found e_k. The missing part of e is bounded in two ways,
 with r_k = F - H e_k, if no eigenvalue of M^(-1) H is below lambda and none of P^(-1) H below kappa.
 The first bound is safe, but too high by up to a thousand on stiff bodies. The second is close, but
 too low if CG has not met the least eigenvalue, since kappa is its least Ritz value. kappa is at
-most 1, the mean of the eigenvalues if P is the diagonal of H. In Newton's own solves
-(CorrectionTest) the missing part counts as the geometric mean of both bounds. With contact, and in
-a solve for the estimate alone (ErrorEstimate), it counts as the first bound.
+most 1, the mean of the eigenvalues if P is the diagonal of H. In Newton's own solves the missing
+part counts as the geometric mean of both bounds. With contact, and in a solve for the estimate
+alone, it counts as the first bound.
 
-A solve for the estimate alone ends if
+A solve ends if |e_k|_M and the missing part together are acceptable. Newton's own solves also end
+by the tolerances of KSP. A solve for the estimate alone also ends if
 
 - |e_k|_M is above the acceptable error, or
-- |e_k|_M and the missing part together are acceptable, or
 - the missing part is at most |e_k|_M, so that the estimate, their sum, is at most twice |e|_M.
 
 Then g can be examined at x - e_k (optimality.Optimality).
@@ -42,6 +42,7 @@ class ErrorEstimate:
     missing    : bound on the part of e that the last estimate has not found [m sqrt(kg)]
     lowest     : lower bound of the eigenvalues of M^(-1) H that the last estimate used
     convexity  : least eigenvalue of M^(-1) H that the step has met, at most 1
+    is_accepted : whether the last solve has shown that the error is acceptable
     products   : products with H, multigrid's finest level included, of all estimates so far
     """
 
@@ -58,7 +59,10 @@ class ErrorEstimate:
         self.correction_norm = self.missing = np.inf
         self.products = 0
         self.lowest = self.convexity = 1.0
-        self._acceptable = 0.0
+        self.is_accepted = False
+        self._acceptable = self._first = 0.0
+        # Least eigenvalue of P^(-1) H that the step has met, at most 1; 0 with contact
+        self._least = 1.0
         self.ksp = PETSc.KSP().create(functional.comm)
         self.ksp.setOptionsPrefix(f"{prefix}estimate_")
         self.ksp.setType(PETSc.KSP.Type.CG)
@@ -68,7 +72,7 @@ class ErrorEstimate:
         pc.setType(PETSc.PC.Type.PYTHON)
         pc.setPythonContext(preconditioner)
         self.ksp.setOperators(self.operator, self.operator)
-        self.ksp.setConvergenceTest(self._converged)
+        self.ksp.setConvergenceTest(self.test)
 
     def __call__(self, iterate: Iterate, acceptable: float = 0.0) -> float:
         """Return an estimate of |x - x*|_M at an iterate (collective).
@@ -77,7 +81,7 @@ class ErrorEstimate:
 
         acceptable : error [m sqrt(kg)]; an estimate above it may be too low
         """
-        self.lowest, self._acceptable = self.convexity, acceptable
+        self.begin(acceptable)
         before = self.hessian.products + self.preconditioner.products
         with ESTIMATE:
             self.linearise(iterate.q, iterate.contact)
@@ -91,83 +95,42 @@ class ErrorEstimate:
         self.hessian.linearise(q, contact)
         self.operator.assemble()
 
-    def _converged(self, ksp: PETSc.KSP, its: int, residual: float) -> PETSc.KSP.ConvergedReason:
-        """Return whether the estimate is complete (the convergence test of KSP)."""
-        reasons = PETSc.KSP.ConvergedReason
-        if not np.isfinite(residual):
-            return reasons.DIVERGED_NANORINF
-        if residual > 0 and its == 0:
-            return reasons.ITERATING
-        self.measure(ksp)
-        is_decided = (
-            0 < self._acceptable < self.correction_norm
-            or self.correction_norm + self.missing <= self._acceptable
-        )
-        if residual == 0 or is_decided or self.missing <= self.correction_norm:
-            return reasons.CONVERGED_ITS
-        return reasons.ITERATING
-
-    def measure(self, ksp: PETSc.KSP, natural: float = np.inf, least: float = 0.0) -> None:
-        """Measure the correction that a solve H e = F has found so far, and its missing part.
-
-        natural : |r_k|_(P^-1)
-        least   : kappa; 0 for the first bound alone
-        """
-        self.residual = ksp.buildResidual(self.residual)
-        self.correction_norm, f = self.functional.norms(ksp.getSolution(), self.residual)
-        self.missing = f / self.lowest
-        if least > 0:
-            close = natural / float(np.sqrt(self.lowest * least))
-            self.missing = min(self.missing, float(np.sqrt(self.missing * close)))
-
-    def destroy(self) -> None:
-        """Destroy all PETSc objects (collective)."""
-        for owned in (self.ksp, self.correction, self.residual, self.operator):
-            owned.destroy()
-
-
-class CorrectionTest:
-    """Convergence test of Newton's solves H y = F by CG, which also tests the error of x.
-
-    y is the correction of an error estimate. CG ends as soon as it shows that |y|_M, the error of
-    x, is acceptable. Otherwise it ends by the tolerances of KSP.
-
-    estimate    : measures y
-    is_accepted : whether the last solve has shown that the error of x is acceptable
-    """
-
-    def __init__(self, estimate: ErrorEstimate, ksp: PETSc.KSP):
-        self.estimate, self.is_accepted = estimate, False
-        # Least eigenvalue of P^(-1) H that the step has met, at most 1; 0 with contact
-        self._least = 1.0
-        self._acceptable = self._first = 0.0
-        ksp.setComputeSingularValues(True)
-        ksp.setConvergenceTest(self)
-
     def begin_step(self, has_contact: bool) -> None:
-        """Forget the last step: its eigenvalues, and the error that it accepted.
+        """Forget the eigenvalues of the last step.
 
         has_contact : whether H has contact, whose small eigenvalues CG meets late
         """
-        self._least, self._acceptable = 0.0 if has_contact else 1.0, 0.0
+        self.convexity, self._least = 1.0, 0.0 if has_contact else 1.0
 
     def begin(self, acceptable: float) -> None:
         """Begin a solve.
 
         acceptable : error [m sqrt(kg)] of x; 0 if the solve does not tell the error
         """
-        self.estimate.lowest, self.is_accepted = self.estimate.convexity, False
-        self._acceptable = acceptable
+        self.lowest, self.is_accepted, self._acceptable = self.convexity, False, acceptable
 
-    def __call__(self, ksp: PETSc.KSP, its: int, residual: float) -> PETSc.KSP.ConvergedReason:
-        """Return whether a solve ends (the convergence test of KSP)."""
+    def test(self, ksp: PETSc.KSP, its: int, residual: float) -> PETSc.KSP.ConvergedReason:
+        """Return whether a solve H e = F by CG ends (the convergence test of KSP)."""
         reasons, (rtol, atol, divtol, _) = PETSc.KSP.ConvergedReason, ksp.getTolerances()
         if not np.isfinite(residual):
             return reasons.DIVERGED_NANORINF
+        is_alone = ksp == self.ksp
         if its == 0:
             self._first = residual
-        elif self._acceptable > 0 and self._accepts(ksp, residual):
-            return reasons.CONVERGED_HAPPY_BREAKDOWN
+        if (its > 0 and self._acceptable > 0) or (is_alone and (its > 0 or residual == 0)):
+            self.is_accepted = self._accepts(ksp, np.inf if is_alone else residual)
+            if self.is_accepted and not is_alone:
+                self._meet_eigenvalues(ksp)
+                self.is_accepted = self._accepts(ksp, residual)
+            is_above = 0 < self._acceptable < self.correction_norm
+            is_known = is_alone and (is_above or self.missing <= self.correction_norm)
+            if self.is_accepted or is_known:
+                return reasons.CONVERGED_HAPPY_BREAKDOWN
+            if is_above:
+                # No later iteration shows that the error is acceptable
+                self._acceptable = 0.0
+        if is_alone:
+            return reasons.ITERATING
         if residual <= atol:
             return reasons.CONVERGED_ATOL
         if residual <= rtol * self._first:
@@ -184,20 +147,20 @@ class CorrectionTest:
         if self._least > 0:
             self._least = min(self._least, ksp.computeExtremeSingularValues()[1])
 
-    def _accepts(self, ksp: PETSc.KSP, residual: float) -> bool:
-        """Return whether the error of x is shown to be acceptable."""
-        estimate = self.estimate
-        if not self._is_below(ksp, residual):
-            if estimate.correction_norm > self._acceptable:
-                # No later iteration shows that the error is acceptable
-                self._acceptable = 0.0
-            return False
-        self._meet_eigenvalues(ksp)
-        self.is_accepted = self._is_below(ksp, residual)
-        return self.is_accepted
+    def _accepts(self, ksp: PETSc.KSP, natural: float) -> bool:
+        """Measure the correction of a solve so far; return whether the error is acceptable.
 
-    def _is_below(self, ksp: PETSc.KSP, residual: float) -> bool:
-        """Return whether the error is acceptable by the eigenvalues met so far."""
-        estimate = self.estimate
-        estimate.measure(ksp, residual, self._least)
-        return estimate.correction_norm + estimate.missing <= self._acceptable
+        natural : |r_k|_(P^-1); infinite for the first bound alone
+        """
+        self.residual = ksp.buildResidual(self.residual)
+        self.correction_norm, f = self.functional.norms(ksp.getSolution(), self.residual)
+        self.missing = f / self.lowest
+        if self._least > 0:
+            close = natural / float(np.sqrt(self.lowest * self._least))
+            self.missing = min(self.missing, float(np.sqrt(self.missing * close)))
+        return self.correction_norm + self.missing <= self._acceptable
+
+    def destroy(self) -> None:
+        """Destroy all PETSc objects (collective)."""
+        for owned in (self.ksp, self.correction, self.residual, self.operator):
+            owned.destroy()

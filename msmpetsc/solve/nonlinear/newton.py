@@ -20,7 +20,6 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import Array, Positions
 from msmpetsc.contact.step_contact import StepContactAt
 from msmpetsc.solve.nonlinear.error_control import Outcome
-from msmpetsc.solve.nonlinear.error_estimate import CorrectionTest
 from msmpetsc.solve.nonlinear.functional import Iterate
 from msmpetsc.solve.nonlinear.jacobian import FrictionDuals
 from msmpetsc.solve.nonlinear.method import REASON, StepMethod
@@ -69,7 +68,10 @@ class Newton(StepMethod):
         # SNES would create a vector of its own
         self.snes.setFunction(None, self.control.estimate.residual)
         self.friction = FrictionDuals()
-        self.test = self._create_test()
+        self.is_tested = self._is_tested()
+        if self.is_tested:
+            self.ksp.setComputeSingularValues(True)
+            self.ksp.setConvergenceTest(self.control.estimate.test)
         self.most_its = self.ksp.getTolerances()[3]
         # V U' of the cells of a softer solid, for the first Hessian of the next solve
         self.slopes: Array | None = None
@@ -82,17 +84,12 @@ class Newton(StepMethod):
         """Begin the step that the functional has begun."""
         self.friction.begin(self.functional.problem.contact)
         self.slopes = None
-        if self.test:
-            self.test.begin_step(self.functional.problem.contact is not None)
 
-    def _create_test(self) -> CorrectionTest | None:
-        """Return the test of CG that also tests the error of x; None for other linear solves."""
+    def _is_tested(self) -> bool:
+        """Return whether linear solves, by CG, also test the error of x."""
         is_cg = self.ksp.getType() == PETSc.KSP.Type.CG
         is_natural = self.ksp.getNormType() == PETSc.KSP.NormType.NATURAL
-        of_user = any(map(self.options.is_given, TESTS))
-        if not (is_cg and is_natural) or of_user:
-            return None
-        return CorrectionTest(self.control.estimate, self.ksp)
+        return is_cg and is_natural and not any(map(self.options.is_given, TESTS))
 
     def minimise(self, start: Iterate, outcome: Outcome) -> tuple[Iterate, Outcome]:
         """Return the iterate that the loop ends at, and its outcome (StepMethod.minimise)."""
@@ -162,7 +159,7 @@ class Newton(StepMethod):
 
     def _can_tell_error(self, projected: int) -> bool:
         """Return whether the next linear solve is of the true elastic Hessian, with the test."""
-        return self.test is not None and not projected and self.slopes is None
+        return self.is_tested and not projected and self.slopes is None
 
     def _tells_error(self, now: Iterate, outcome: Outcome, projected: int) -> bool:
         """Return whether the next linear solve tests the error of x.
@@ -197,14 +194,12 @@ class Newton(StepMethod):
             most = self.jacobian.preconditioner.most_iterations(rtol)
             self.ksp.setTolerances(max_it=most or self.most_its)
         self.ksp.setOperators(self.jacobian.operator)
-        if self.test:
-            acceptable = outcome.goal * outcome.distance if tells_error else 0.0
-            self.test.begin(acceptable)
+        self.control.estimate.begin(outcome.goal * outcome.distance if tells_error else 0.0)
         self.ksp.solve(now.f, self.y)
         self.jacobian.preconditioner.learn(self.ksp.its, rtol)
         if self.ksp.reason == KSP.DIVERGED_INDEFINITE_MAT:
             return replace(outcome, alarm=True, corrected=False)
-        if self.test and self.test.is_accepted:
+        if self.control.estimate.is_accepted:
             return self.control.measured(now, outcome, self._trust(now, outcome))
         return replace(outcome, corrected=tells_error and self.ksp.reason > 0)
 

@@ -245,7 +245,7 @@ class Stepper:
         self.functional.begin(problem)
         self.control.rounding.refuse_loads()
         self.method.begin()
-        self.control.estimate.convexity = 1.0
+        self.control.estimate.begin_step(problem.contact is not None)
         guess = self.first_guess.best() if start is None else start
         if start is None or self.static:
             guess = self.carried_start.find(

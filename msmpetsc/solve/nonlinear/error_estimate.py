@@ -155,7 +155,7 @@ class ErrorEstimate:
         self.residual = ksp.buildResidual(self.residual)
         self.correction_norm, f = self.functional.norms(ksp.getSolution(), self.residual)
         self.missing = f / self.lowest
-        if self._least > 0:
+        if self._least > 0 and np.isfinite(natural):
             close = natural / float(np.sqrt(self.lowest * self._least))
             self.missing = min(self.missing, float(np.sqrt(self.missing * close)))
         return self.correction_norm + self.missing <= self._acceptable

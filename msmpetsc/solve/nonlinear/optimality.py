@@ -70,12 +70,11 @@ class Optimality:
     def examine(self, at: Iterate, outcome: Outcome, acceptable: float) -> Verdict:
         """Examine g at x - e, or at x if the iterate has no correction e; return the verdict.
 
-        outcome    : of the iterate, with its compression; ``corrected`` if estimate.correction
-                     is e
+        outcome    : of the iterate; ``corrected`` if estimate.correction is e
         acceptable : acceptable error |e|_M [m sqrt(kg)]
         """
-        functional, estimate, compression = self.functional, self.estimate, outcome.compression
-        assert compression is not None
+        functional, estimate = self.functional, self.estimate
+        compression = self.curvature.compression(at.q)
         examined = self._corrected_iterate(at) if outcome.corrected else None
         corrected = examined is not None
         length = functional.norm(estimate.correction) if corrected else 0.0
@@ -85,7 +84,7 @@ class Optimality:
         # Change of F that H at the iterate does not predict
         bent = functional.dual_norm(estimate.residual)
         hint = estimate.correction if outcome.alarm else None
-        value, direction = compression.least_curvature, None
+        value, direction = self.curvature.least(compression), None
         if value <= CONVEX:
             value, direction = self.curvature.lowest(examined.q, compression, outcome.alarm, hint)
         if value < 0:

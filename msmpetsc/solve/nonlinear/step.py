@@ -130,8 +130,7 @@ class Stepper:
                     self.functional, self.preset, self.options, self.touches, self.owned
                 )
                 self.snes, self.ksp = self._create_solvers()
-                self.control, self.optimality = self._create_control()
-                self.method = self._create_method()
+                self._create_method()
                 self.carried_start = CarriedStart(self.functional, self.jacobian, self.ksp)
         except InputError:
             self.destroy()
@@ -178,31 +177,27 @@ class Stepper:
                     "their own; presets anderson and lbfgs take it"
                 )
 
-    def _create_control(self) -> tuple[ErrorControl, Optimality]:
+    def _create_method(self) -> None:
         functional, jacobian = self.functional, self.jacobian
         hessian, preconditioner = jacobian.hessian, jacobian.preconditioner
         estimate = self._keep(ErrorEstimate(functional, hessian, preconditioner, self.prefix))
         curvature = LowestCurvature(functional, hessian, preconditioner)
         rounding = Rounding(functional, jacobian.diagonal)
-        optimality = Optimality(functional, estimate, curvature, rounding)
+        self.optimality = Optimality(functional, estimate, curvature, rounding)
         error = self.error
         if error is None and not self.budget:
             error = DEFAULT_STEP_ERROR
         rtol = self.ksp.getTolerances()[0]
-        control = ErrorControl(functional, estimate, curvature, rounding, error or 0.0, rtol)
-        return control, optimality
-
-    def _create_method(self) -> Newton | LocalGlobal:
+        self.control = ErrorControl(functional, estimate, curvature, rounding, error or 0.0, rtol)
         given = (
             self.functional, self.jacobian, self.snes, self.ksp, self.control, self.preset,
             self.options, self.budget, self.spent,
         )  # fmt: skip
         if self.preset.true_hessian:
-            method: Newton | LocalGlobal = Newton(*given)
-            self.snes.setPythonContext(method)
+            self.method: Newton | LocalGlobal = Newton(*given)
+            self.snes.setPythonContext(self.method)
         else:
-            method = LocalGlobal(*given, self.prefix, self.options.is_given("npc_snes_type"))
-        return method
+            self.method = LocalGlobal(*given, self.prefix, self.options.is_given("npc_snes_type"))
 
     def set_up(self) -> None:
         """Build the preconditioner before the first step; Cholesky factorises here.
@@ -330,10 +325,9 @@ class Stepper:
     def examine(self, now: Iterate, outcome: Outcome) -> Verdict:
         """Return whether an iterate is a minimum, and its error (collective)."""
         control = self.control
-        outcome = control.with_compression(now, outcome)
-        assert outcome.compression is not None
+        curvature = self.optimality.curvature
         # A budget may end far from the minimum
-        if outcome.compression.least_curvature > 0 and not self.budget:
+        if not self.budget and curvature.least(curvature.compression(now.q)) > 0:
             return Verdict(outcome.error, now, is_minimum=True)
         enough = control.target * self.functional.distance(now.q) if control.target else np.inf
         verdict = self.optimality.examine(now, outcome, enough)

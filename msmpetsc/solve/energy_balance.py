@@ -118,7 +118,9 @@ class EnergyBalance:
             given.pressures.change(q, lattice.nodes) - np.vdot(given.force, at),
             *(lattice.mass @ v),
         )
-        return Energies(*sums[:5], momentum=sums[5:], touch=environment.touch(q, time))
+        kinetic, moving, elastic, pressed, potential = sums[:5]
+        touch = environment.touch(q, time)
+        return Energies(kinetic, moving, elastic, pressed, potential, sums[5:], touch)
 
     def examine(
         self, before: State, result: StepResult, after: State, time: float, time_step: float

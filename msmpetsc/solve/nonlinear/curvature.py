@@ -72,7 +72,7 @@ class LowestCurvature:
         if functional.surface:
             concavity = concavity + functional.surface.concavity(q)[free]
         ratios = functional.t2 * concavity / functional.lattice.mass[free]
-        return self.comm.allreduce(float(greatest(ratios)), MPI.MAX)
+        return float(self.comm.allreduce(greatest(ratios), MPI.MAX))
 
     def least(self, compression: float) -> float:
         """Return a lower bound of the eigenvalues of M^(-1) H.

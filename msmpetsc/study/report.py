@@ -21,7 +21,6 @@ from msmpetsc.study.charts.stability import stability_charts
 from msmpetsc.study.outcomes import counted
 from msmpetsc.study.table import (
     NUMBERS,
-    ONCE_NOTE,
     TEXT,
     failed,
     is_repeated,
@@ -95,7 +94,7 @@ def facts(table: DataFrame) -> dict[str, Any]:
     rows = timed(plain)
     # empty if no case succeeded
     often = " or ".join(map(str, sorted(set(rows["repeats"].fillna(1).astype(int)))))
-    note = often and f"{often}. {ONCE_NOTE}"
+    note = often and f"{often}: how much times vary is not known; repeats = 3 would tell"
     if not rows.empty and is_repeated(rows):
         note = f"{often}: times are medians, ranges and whiskers from the least to the greatest"
     return counts | {"maps": maps, "platforms": platforms, "repeats": note}

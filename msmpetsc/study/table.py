@@ -34,10 +34,6 @@ TEXT = (
     "status", "reason", "outcome", "machine", "versions", "command",
 )  # fmt: skip
 NUMBERS = tuple(name for name in COLUMNS if name not in TEXT)
-ONCE_NOTE = (
-    "Each was run once: how much its time varies is not known, so that close times decide nothing; "
-    "repeats = 3 would tell."
-)
 
 
 def require_extra() -> None:

@@ -124,14 +124,6 @@ def test_the_cheapest_is_a_measured_point_and_each_error_has_its_own():
     assert [*contenders(rows, TRAJECTORY, 0.2)["label"]] == ["verlet"], (
         "0.02 s for 0.01 s: 2 s a simulated second"
     )
-    (chart,) = pareto_charts(rows, curve_styles(rows["label"]))
-    step, trajectory = ([spaced(line) for line in lines] for lines in chart.findings.values())
-    assert (
-        "anderson, 30 ms a frame" in step[0] and "verlet, 2 s a simulated second" in trajectory[2]
-    )
-    assert "nothing" in step[3] and len(step) == 5, (
-        "a line more: how much times vary is not known of single runs"
-    )
 
 
 def repeated(label: str, low: float, time: float, high: float, **given) -> dict[str, str]:
@@ -165,15 +157,6 @@ def test_no_winner_is_told_within_its_noise():
         "a time within the range of the cheapest"
     )
     (chart,) = pareto_charts(rows, curve_styles(rows["label"]))
-    step, trajectory = ([spaced(line) for line in lines] for lines in chart.findings.values())
-    assert "newton, 10 ms [9 ms to 21 ms] a frame" in step[1] and "noise" in step[1]
-    assert re.findall(r"(\w+) [\d.]+ ms (\[.*?\])", step[1].partition("noise")[2]) == [
-        ("pipecg", "[9 ms to 22 ms]"), ("anderson", "[20 ms to 37 ms]"),
-    ]  # fmt: skip
-    assert (
-        "newton, 1 s [900 ms to 2.1 s] a simulated second" in trajectory[0]
-        and "pipecg" in trajectory[0]
-    )
     (rings,) = [layer for layer in chart.panels[0].layers if layer["mark"].get("shape") == RING]
     assert sorted(ring["y"] for ring in rings["data"]["values"]) == [
         0.01,
@@ -360,11 +343,6 @@ def test_surface_errors_are_drawn_over_cost_a_curve_a_way_to_step(tmp_path: Path
     assert "Surface error over cost: heart" in text and (tmp_path / "size_heart.png").is_file()
     # a chart over cost and a chart over cells
     assert len([title for title in tooltips(text) if "surface error " in title]) == 2 * 6
-    assert (
-        "10%: whole 2,000" in text
-        and "fill 418" in text
-        and "1%: whole more than 2,000 cells" in text
-    )
     assert "a pin holds no node" in text
     table = read_table(tmp_path)
     (chart,) = size_charts(table, curve_styles(table["label"]))
@@ -409,8 +387,6 @@ def test_a_profile_is_the_share_within_each_factor():
     right = pytest.approx(1.1 * 3)
     assert steps["newton"] == [(1, 0.4), (2, 0.8), (right, 0.8)]
     assert steps["anderson"] == [(1, 0.4), (3, 0.6), (right, 0.6)]
-    (lines,) = chart.findings.values()
-    assert lines[0] == "newton: 40% at 1, 80% at 2, 80% at 5, 80% in all."
 
 
 def test_a_profile_needs_three_problems_with_the_same_methods():

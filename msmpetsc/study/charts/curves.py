@@ -27,20 +27,9 @@ from msmpetsc.study.charts.plot import (
     log_axis,
     points,
 )
-from msmpetsc.study.table import (
-    ONCE_NOTE,
-    Row,
-    grouped,
-    is_repeated,
-    measured,
-    records,
-    spread,
-    succeeded,
-)
+from msmpetsc.study.table import grouped, measured, records, spread, succeeded
 
 SPEED_ACCURACY = "Speed against accuracy"
-# errors for which the cheapest case is reported
-LEVELS = (1e-1, 1e-2, 1e-3, 1e-6)
 FRONT = "Pareto front, or within its noise"
 CAPTION = (
     "Lower is faster, further left is more exact. A line joins the Pareto-optimal points of a "
@@ -157,12 +146,6 @@ def pareto_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Char
     chart = Chart(name, SPEED_ACCURACY, title, CAPTION, legend)
     for measure, shown in panels:
         draw_panel(chart, shown, measure)
-        lines = [
-            cheapest_line(measure, level, contenders(shown, measure, level)) for level in LEVELS
-        ]
-        chart.findings[f"The cheapest by {measure.name}"] = lines + (
-            [] if is_repeated(shown) else [ONCE_NOTE]
-        )
     return chart
 
 
@@ -192,28 +175,6 @@ def draw_panel(chart: Chart, rows: DataFrame, measure: ErrorMeasure) -> None:
     panel.rings(rows.loc[front.index.union(tied)], measure.columns)
 
 
-def cheapest_line(measure: ErrorMeasure, level: float, best: DataFrame) -> str:
-    """Return a sentence that names the cheapest case and the methods within its noise."""
-    start = f"{formatting.error(level)} or less:"
-    if best.empty:
-        return f"{start} nothing measured reaches it."
-    unit = measure.y_label.removeprefix("computing time ")
-    row, *rivals = records(best.drop_duplicates("label"))
-    near = ", ".join(f"{rival['label']} {cost_of(rival, measure)}" for rival in rivals)
-    names = (measure.error, "error", *STEPPING)
-    numbers = ", ".join(filter(None, (formatting.entry(row, name) for name in names)))
-    noise = f"; within its noise, so none is known to be the cheapest: {near}" if near else ""
-    return f"{start} {row['label']}, {cost_of(row, measure)} {unit} ({numbers}){noise}."
-
-
-def cost_of(row: Row, measure: ErrorMeasure) -> str:
-    """Return the cost of a row with its range over the repeats, if known: 10 ms [9 ms to 21 ms]."""
-    ends = [
-        formatting.seconds(row[name]) for name in ("least", "greatest") if row[name] is not None
-    ]
-    return formatting.seconds(row[measure.cost]) + (f" [{' to '.join(ends)}]" if ends else "")
-
-
 # ---- surface error over cost
 
 SIZES = "Surface error over cost"
@@ -221,8 +182,7 @@ SIZES_CAPTION = (
     "Lower is more exact, further left is cheaper. The surface error is the distance of the "
     "surface from that of a run with many more cells and shorter steps: rms over surface and time, "
     "relative to its largest displacement. It contains the errors of cells, time step and solver. "
-    "A line joins runs of a method from few cells to many; rings mark the Pareto front. The cost "
-    "of an error is interpolated on these lines between the logarithms of two points."
+    "A line joins runs of a method from few cells to many; rings mark the Pareto front."
 )
 SIZE = ("time_second", "surface_error")
 
@@ -240,11 +200,6 @@ def size_charts(table: DataFrame, styles: Styles) -> list[Chart]:
         chart.title += f": {next(iter(scenes))}"
     for scene, rows in scenes.items():
         draw_sizes(chart, scene, rows.sort_values("cells", kind="stable"))
-        chart.findings[f"Cells and cost for a surface error: {scene}"] = lines = []
-        curves = grouped(rows, "label").items()
-        for level in (0.1, 0.03, 0.01):
-            ends = ", ".join(f"{label} {size_for(group, level)}" for label, group in curves)
-            lines.append(f"{100 * level:g}%: {ends}.")
     return [chart]
 
 
@@ -256,22 +211,6 @@ def draw_sizes(chart: Chart, scene: str, rows: DataFrame) -> None:
     over_cells = chart.panel("", log_axis("valid cells", rows["cells"], COUNT), y)
     for panel, columns in ((over_cost, SIZE), (over_cells, ("cells", "surface_error"))):
         panel.curves(rows, columns, (*columns[::-1], "cells", "time_step", "error"))
-
-
-def size_for(rows: DataFrame, level: float) -> str:
-    """Return the cells and the cost beyond which a curve's errors stay below a level."""
-    above = np.flatnonzero(rows["surface_error"] > level)
-    if len(above) == 0:
-        cells, seconds = rows.iloc[0][["cells", "time_second"]]
-        return f"{formatting.count(cells)} cells or fewer ({formatting.seconds(seconds)})"
-    if above[-1] + 1 == len(rows):
-        return f"more than {formatting.count(rows['cells'].iloc[-1])} cells"
-    between = rows.iloc[[above[-1] + 1, above[-1]]][["surface_error", "cells", "time_second"]]
-    logs = np.log(between.to_numpy(float)).T
-    cells, seconds = (
-        float(np.exp(np.interp(np.log(level), logs[0], column))) for column in logs[1:]
-    )
-    return f"{formatting.count(round(cells))} cells ({formatting.seconds(seconds)})"
 
 
 # ---- growth with the number of cells, as in the paper's Figure 6

@@ -202,13 +202,12 @@ def points(
 
 @dataclass
 class Chart:
-    """Panels with a common legend, and sentences that summarise them.
+    """Panels with a common legend.
 
     name     : name of its PNG file without suffix
     kind     : heading that it shares with similar charts
     columns  : largest number of panels side by side
     gap      : distance between panels, which contains the axis labels [px]
-    findings : lines by their heading
     """
 
     name: str
@@ -220,7 +219,6 @@ class Chart:
     gap: float = 85
     height: float = HEIGHT
     panels: list[Axes] = field(default_factory=list)
-    findings: dict[str, list[str]] = field(default_factory=dict)
 
     @property
     def anchor(self) -> str:

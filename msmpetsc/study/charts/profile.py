@@ -9,9 +9,8 @@ from collections.abc import Iterator
 import numpy as np
 from pandas import DataFrame
 
-from msmpetsc.backend.arrays import Floats
 from msmpetsc.study.charts.plot import Chart, Styles, channel, nominal
-from msmpetsc.study.table import ONCE_NOTE, is_repeated, measured, succeeded
+from msmpetsc.study.table import measured, succeeded
 
 PROFILE = "Performance profile"
 CAPTION = (
@@ -26,8 +25,8 @@ PROBLEM = ["scene", "time_step", "error", "cells"]
 FEWEST = 3
 # title of a panel by its column
 COSTS = {"time_frame": "seconds", "products": "products with the Hessian"}
-# factors whose shares are told, and the longest axis [-]
-FACTORS, FARTHEST = (1, 2, 5), 100.0
+# longest axis [-]
+FARTHEST = 100.0
 
 
 def profile_charts(table: DataFrame, styles: Styles) -> list[Chart]:
@@ -87,11 +86,6 @@ def profile_chart(name: str, problems: list[DataFrame], styles: Styles) -> Chart
         factors = ratios(problems, cost)
         if np.isfinite(factors).any(axis=None):
             draw_profile(chart, title, factors)
-            lines = [line_of(label, factors[label].to_numpy()) for label in labels]
-            once = cost == "time_frame" and not all(map(is_repeated, problems))
-            chart.findings[f"Solved within a factor of the fewest {title}"] = lines + (
-                [ONCE_NOTE] if once else []
-            )
     return chart
 
 
@@ -113,9 +107,3 @@ def draw_profile(chart: Chart, title: str, factors: DataFrame) -> None:
     line = {"type": "line", "interpolate": "step-after", "strokeWidth": 1.6}
     panel.draw(values, line, order={"field": "n"}, **own)
     panel.mark(values)
-
-
-def line_of(label: str, factors: Floats) -> str:
-    """Return a sentence with the shares of a method: newton: 50% at 1, 75% at 2, 100% in all."""
-    shares = [f"{(factors <= factor).mean():.0%} at {factor}" for factor in FACTORS]
-    return f"{label}: {', '.join(shares)}, {np.isfinite(factors).mean():.0%} in all."

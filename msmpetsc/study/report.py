@@ -53,7 +53,7 @@ def write_report(folder: Path) -> Path:
         *size_charts(sweeps, styles),
         *pareto_charts(sweeps, styles),
         *profile_charts(sweeps, styles),
-        *growth_charts(sweeps, styles),
+        *growth_charts(sweeps),
     ]
     for chart in charts:
         save_png(chart, folder)

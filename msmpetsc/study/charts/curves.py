@@ -6,7 +6,6 @@ from the true motion of the lattice: it compares integrators and time steps of a
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,10 +19,10 @@ from msmpetsc.study.charts.plot import (
     INK,
     RING,
     SECONDS,
-    SHAPES,
     Chart,
     CurveStyle,
     Styles,
+    curve_styles,
     log_axis,
     points,
 )
@@ -244,59 +243,49 @@ GROWTH_PANELS = (
 )
 
 
-def growth_charts(table: DataFrame, styles: Styles) -> list[Chart]:
+def growth_charts(table: DataFrame) -> list[Chart]:
     """Return a chart for each scene and time step with at least two cell counts on a curve."""
     charts = []
     for (scene, time_step), rows in grouped(
         measured(succeeded(table), "cells"), "scene", "time_step"
     ).items():
         rows = with_curves(rows)
-        if rows.groupby("curve")["cells"].nunique().max() > 1:
+        if rows.groupby("label")["cells"].nunique().max() > 1:
             step = f", time step {formatting.seconds(time_step)}" if time_step > 0 else ""
             charts.append(
                 growth_chart(
-                    f"growth_{scene}_{formatting.plain(time_step)}", f"{scene}{step}", rows, styles
+                    f"growth_{scene}_{formatting.plain(time_step)}", f"{scene}{step}", rows
                 )
             )
     return [chart for chart in charts if chart.panels]
 
 
 def with_curves(rows: DataFrame) -> DataFrame:
-    """Return the rows with a column ``curve``: method, options that vary, and step error."""
+    """Return the rows with labels of curves: method, options that vary, and step error."""
     varied = [
         name for name in VARIED if (rows.groupby("label")[name].nunique(dropna=False) > 1).any()
     ]
     words = (
         [row["label"], *(formatting.entry(row, name) for name in varied)] for row in records(rows)
     )
-    rows = rows.assign(curve=[", ".join(filter(None, text)) for text in words])
-    names = {curve: curve for curve in rows["curve"]}
-    for curve, reached in grouped(measured(rows, "true_error"), "curve").items():
+    rows = rows.assign(label=[", ".join(filter(None, text)) for text in words])
+    names = {label: label for label in rows["label"]}
+    for label, reached in grouped(measured(rows, "true_error"), "label").items():
         ends = dict.fromkeys(
             map(formatting.error, (reached["true_error"].min(), reached["true_error"].max()))
         )
-        names[curve] += f" (step error {' to '.join(ends)})"
-    return rows.assign(curve=rows["curve"].map(names))
+        names[label] += f" (step error {' to '.join(ends)})"
+    return rows.assign(label=rows["label"].map(names))
 
 
-def styles_of(curves: DataFrame, styles: Styles) -> Styles:
-    """Return the style of each curve; curves of a label share its colour but not its marker."""
-    of_curves = {}
-    number = curves.groupby("label").cumcount()
-    for curve, label, more in zip(curves["curve"], curves["label"], number, strict=True):
-        shape = SHAPES[(SHAPES.index(styles[label].shape) + more) % len(SHAPES)]
-        of_curves[curve] = replace(styles[label], shape=shape)
-    return of_curves
-
-
-def growth_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Chart:
+def growth_chart(name: str, title: str, rows: DataFrame) -> Chart:
     """Return the chart of a scene and time step, with the panels that have data."""
+    styles = curve_styles(rows["label"])
     rows = rows.assign(
         time_frame_a_cell=rows["time_frame"] / rows["cells"],
         memory_a_cell=rows["memory"] / rows["cells"],
     ).sort_values("cells", kind="stable")
-    own = styles_of(rows[["curve", "label"]].drop_duplicates().sort_index(), styles)
-    chart = Chart(name, GROWTH, f"Growth with cells: {title}", GROWTH_CAPTION, own, columns=2)
+    chart = Chart(name, GROWTH, f"Growth with cells: {title}", GROWTH_CAPTION, styles, columns=2)
     for title, column, words, timed in GROWTH_PANELS:
         shown = measured(rows, column)
         if shown.empty:
@@ -308,6 +297,6 @@ def growth_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Char
             drawn += ["least", "greatest"]
         panel = chart.panel(title, x, log_axis("", shown[drawn].to_numpy(), words))
         if timed:
-            panel.whiskers(shown, ("cells", column), "curve")
-        panel.curves(shown, ("cells", column), ("cells", column, *GROWTH_TIP), "curve")
+            panel.whiskers(shown, ("cells", column))
+        panel.curves(shown, ("cells", column), ("cells", column, *GROWTH_TIP))
     return chart

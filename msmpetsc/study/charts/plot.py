@@ -7,8 +7,9 @@ import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from itertools import cycle
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import vl_convert
@@ -28,8 +29,6 @@ COLORS = (
 X = "M-1,-.6L-.6,-1L0,-.4L.6,-1L1,-.6L.4,0L1,.6L.6,1L0,.4L-.6,1L-1,.6L-.4,0Z"
 STAR = "M0,-1.2L.35,-.4L1.15,-.37L.52,.15L.7,.97L0,.5L-.7,.97L-.52,.15L-1.15,-.37L-.35,-.4Z"
 SHAPES = ("circle", "square", "triangle-up", "diamond", "triangle-down", "cross", X, STAR)
-# dashes of lines, taken in turn whenever the colours are used up
-DASHES = ((1, 0), (6, 3), (2, 2))
 RING = "M1,0A1,1,0,1,1,-1,0A1,1,0,1,1,1,0M.86,0A.86,.86,0,1,0,-.86,0A.86,.86,0,1,0,.86,0"
 # width of a chart and height of a panel [px]
 WIDTH, HEIGHT = 1080, 280
@@ -60,13 +59,11 @@ COUNT = "format(datum.value, '~s')"
 SECONDS, BYTES = UNIT.format("s"), UNIT.format("B")
 
 
-@dataclass(frozen=True)
-class CurveStyle:
-    """Colour, marker and dashes of a method, the same in all charts."""
+class CurveStyle(NamedTuple):
+    """Colour and marker of a method."""
 
     color: str
     shape: str
-    dash: tuple[int, int] = DASHES[0]
 
 
 # style of each label, and columns on the x axis and the y axis
@@ -76,21 +73,15 @@ Columns = tuple[str, str]
 
 def curve_styles(labels: Iterable[str]) -> Styles:
     """Return a style for each label, assigned in order of first appearance."""
-
-    def style(n: int) -> CurveStyle:
-        rounds = n // len(COLORS)
-        return CurveStyle(
-            COLORS[n % len(COLORS)], SHAPES[n % len(SHAPES)], DASHES[rounds % len(DASHES)]
-        )
-
-    return {label: style(n) for n, label in enumerate(dict.fromkeys(labels))}
+    styles = map(CurveStyle, cycle(COLORS), cycle(SHAPES))
+    return dict(zip(dict.fromkeys(labels), styles, strict=False))
 
 
-def tips(rows: DataFrame, names: Iterable[str], curve: str = "label") -> list[str]:
-    """Return the tooltip of each row: its curve, its numbers, and the command that repeats it."""
+def tips(rows: DataFrame, names: Iterable[str]) -> list[str]:
+    """Return the tooltip of each row: its label, its numbers, and the command that repeats it."""
     names = list(dict.fromkeys(names))
     lines = (
-        [row[curve], *(formatting.entry(row, name) for name in names), row["command"]]
+        [row["label"], *(formatting.entry(row, name) for name in names), row["command"]]
         for row in records(rows)
     )
     return ["\n".join(filter(None, tip)) for tip in lines]
@@ -140,27 +131,29 @@ class Axes:
             )
 
     def stair(self, x: Iterable[float], y: Iterable[float]) -> None:
-        """Draw a grey step function through points in their order."""
-        values = [{"x": a, "y": b, "n": n} for n, (a, b) in enumerate(zip(x, y, strict=True))]
+        """Draw a grey step function through points by increasing x."""
+        values = [{"x": a, "y": b} for a, b in zip(x, y, strict=True)]
         mark = {"type": "line", "color": FAINT, "interpolate": "step-after", "strokeWidth": 1.2}
-        self.draw(values, mark, order={"field": "n"})
+        self.draw(values, mark)
 
-    def whiskers(self, rows: DataFrame, columns: Columns, curve: str = "label") -> None:
+    def whiskers(self, rows: DataFrame, columns: Columns) -> None:
         """Draw the range of each row over its repeats; the second column is its cost."""
-        ends = spread(rows, columns[1]).assign(x=rows[columns[0]], curve=rows[curve]).dropna()
+        ends = spread(rows, columns[1]).assign(x=rows[columns[0]], curve=rows["label"]).dropna()
         values = records(ends.rename(columns={"least": "y", "greatest": "high"}))
         part = {"opacity": 1, "aria": False}
         bar = {"type": "errorbar", "ticks": part | {"size": 7}, "rule": part}
         self.draw(values, bar, y2={"field": "high"}, color=nominal(self.styles, "color"))
 
-    def curves(
-        self, rows: DataFrame, columns: Columns, names: Iterable[str], curve: str = "label"
-    ) -> None:
+    def curves(self, rows: DataFrame, columns: Columns, names: Iterable[str]) -> None:
         """Draw each curve's rows, in their order, as a line with a marker at each point."""
-        values = points(rows, columns, names, curve)
-        own = {"color": nominal(self.styles, "color"), "strokeDash": nominal(self.styles, "dash")}
-        self.draw(values, {"type": "line", "strokeWidth": 1.6}, order={"field": "n"}, **own)
+        values = points(rows, columns, names)
+        self.line(values)
         self.mark(values)
+
+    def line(self, values: list[dict[str, Any]], **mark: Any) -> None:
+        """Draw a line through the values of each curve, in their order."""
+        line = {"type": "line", "strokeWidth": 1.6} | mark
+        self.draw(values, line, order={"value": None}, color=nominal(self.styles, "color"))
 
     def mark(self, values: list[dict[str, Any]], hollow: bool = False) -> None:
         """Draw a marker with a tooltip for each value from ``points``, small if ``hollow``."""
@@ -187,17 +180,10 @@ class Axes:
         )
 
 
-def points(
-    rows: DataFrame, columns: Columns, names: Iterable[str], curve: str = "label"
-) -> list[dict[str, Any]]:
+def points(rows: DataFrame, columns: Columns, names: Iterable[str]) -> list[dict[str, Any]]:
     """Return each row as a point with coordinates, curve and tooltip."""
-    of_rows = zip(
-        *(rows[name] for name in (*columns, curve)), tips(rows, names, curve), strict=True
-    )
-    return [
-        {"x": x, "y": y, "curve": name, "tip": tip, "n": n}
-        for n, (x, y, name, tip) in enumerate(of_rows)
-    ]
+    values = rows[[*columns, "label"]].set_axis(["x", "y", "curve"], axis=1)
+    return records(values.assign(tip=tips(rows, names)))
 
 
 @dataclass
@@ -266,7 +252,7 @@ def legend(styles: Styles) -> dict[str, Any]:
 
 
 def nominal(styles: Styles, name: str, legend: dict[str, Any] | None = None) -> dict[str, Any]:
-    """Return the channel that encodes a curve as its "color", "shape" or "dash"."""
+    """Return the channel that encodes a curve as its "color" or "shape"."""
     scale = {"domain": list(styles), "range": [getattr(style, name) for style in styles.values()]}
     return {"field": "curve", "type": "nominal", "scale": scale, "legend": legend}
 

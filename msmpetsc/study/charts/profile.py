@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 from pandas import DataFrame
 
-from msmpetsc.study.charts.plot import Chart, Styles, channel, nominal
+from msmpetsc.study.charts.plot import Chart, Styles, channel
 from msmpetsc.study.table import measured, succeeded
 
 PROFILE = "Performance profile"
@@ -99,11 +99,9 @@ def draw_profile(chart: Chart, title: str, factors: DataFrame) -> None:
     panel = chart.panel(f"by {title}", x, y)
     values = []
     for label, column in zip(factors, known.T, strict=True):
-        for n, end in enumerate(np.unique([1.0, *column[column <= right], right]).tolist()):
+        for end in np.unique([1.0, *column[column <= right], right]).tolist():
             share = float((column <= end).mean())
             tip = f"{label}\n{share:.0%} within {end:.3g}"
-            values.append({"x": end, "y": share, "curve": label, "tip": tip, "n": n})
-    own = {"color": nominal(chart.styles, "color"), "strokeDash": nominal(chart.styles, "dash")}
-    line = {"type": "line", "interpolate": "step-after", "strokeWidth": 1.6}
-    panel.draw(values, line, order={"field": "n"}, **own)
+            values.append({"x": end, "y": share, "curve": label, "tip": tip})
+    panel.line(values, interpolate="step-after")
     panel.mark(values)

@@ -6,7 +6,6 @@ from the true motion of the lattice: it compares integrators and time steps of a
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from pandas import DataFrame, concat
@@ -20,6 +19,7 @@ from msmpetsc.study.charts.plot import (
     RING,
     SECONDS,
     Chart,
+    Columns,
     CurveStyle,
     Styles,
     curve_styles,
@@ -29,50 +29,35 @@ from msmpetsc.study.charts.plot import (
 from msmpetsc.study.table import grouped, measured, records, spread, succeeded
 
 SPEED_ACCURACY = "Speed against accuracy"
-FRONT = "Pareto front, or within its noise"
+FRONT = "Pareto front"
 CAPTION = (
     "Lower is faster, further left is more exact. A line joins the Pareto-optimal points of a "
     "method; its other points are small and hollow. A point is the median of the repeats; whiskers "
-    "reach from the least to the greatest. The grey stair is the Pareto front: no measured case is "
-    "both cheaper and more exact, with errors compared to two digits. Rings mark its points and "
-    "the points whose ranges overlap theirs, because the repeats do not tell which is cheaper. The "
+    "reach from the least to the greatest, and points whose whiskers overlap may cost the same. "
+    "Rings and the grey stair are the Pareto front: no measured case is both cheaper and more "
+    "exact, with errors compared to two digits. The "
     "step error is that of solving a step; the trajectory error is that of the whole motion, time "
     "step included."
 )
-STEPPING = ("time_step", "substep")
 # columns of a point's tooltip
-TIP = ("least", "greatest", *STEPPING, "error", "max_iterations", "iterations", "ranks")
-
-
-class ErrorMeasure(NamedTuple):
-    """A panel of cost over error: the columns of both, and their axis titles."""
-
-    error: str
-    cost: str
-    name: str
-    x_label: str
-    y_label: str
-
-    @property
-    def columns(self) -> tuple[str, str]:
-        """Columns of the x axis and the y axis."""
-        return self.error, self.cost
-
-
-STEP = ErrorMeasure(
-    error="true_error",
-    cost="time_frame",
-    name="step error",
-    x_label="true step error |x \N{MINUS SIGN} x*| / |y \N{MINUS SIGN} x*|, rms over steps",
-    y_label="computing time a frame",
-)
-TRAJECTORY = ErrorMeasure(
-    error="trajectory_error",
-    cost="time_second",
-    name="trajectory error",
-    x_label="trajectory error against a reference with a tiny step",
-    y_label="computing time a simulated second",
-)
+TIP = (
+    "least", "greatest", "time_step", "substep", "error", "max_iterations", "iterations", "ranks",
+)  # fmt: skip
+# error and cost of a panel
+STEP = ("true_error", "time_frame")
+TRAJECTORY = ("trajectory_error", "time_second")
+COST = "computing time a simulated second"
+# titles of a panel, its x axis and its y axis
+TITLES = {
+    STEP: (
+        "over the step error",
+        "true step error |x \N{MINUS SIGN} x*| / |y \N{MINUS SIGN} x*|, rms over steps",
+        "computing time a frame",
+    ),
+    TRAJECTORY: (
+        "over the trajectory error", "trajectory error against a reference with a tiny step", COST,
+    ),
+}  # fmt: skip
 
 
 def front(x: Sequence[float], y: Sequence[float]) -> list[int]:
@@ -84,94 +69,67 @@ def front(x: Sequence[float], y: Sequence[float]) -> list[int]:
     return [int(index) for index in np.lexsort((y, x)) if not beaten[index]]
 
 
-def front_rows(rows: DataFrame, measure: ErrorMeasure) -> DataFrame:
-    """Return the Pareto-optimal rows in the order of their error.
+def front_rows(rows: DataFrame, columns: Columns) -> DataFrame:
+    """Return the Pareto-optimal rows by error and cost, in the order of their error.
 
     Errors that agree to two digits count as equal: solving a step better improves the trajectory
     error only in later digits, which justify no cost.
     """
-    return rows.iloc[
-        front([float(f"{error:.1e}") for error in rows[measure.error]], list(rows[measure.cost]))
-    ]
-
-
-def contenders(rows: DataFrame, measure: ErrorMeasure, level: float) -> DataFrame:
-    """Return the cheapest row with an error up to ``level``, and rows with overlapping ranges."""
-    rows = measured(rows, *measure.columns)
-    rows = rows[rows[measure.error] <= level].sort_values(measure.cost, kind="stable")
-    reached = rows.assign(**spread(rows, measure.cost))
-    least, greatest = (reached[end].fillna(reached[measure.cost]) for end in ("least", "greatest"))
-    overlapping: DataFrame = reached[least <= greatest.head(1).max()]
-    return overlapping
+    error, cost = columns
+    return rows.iloc[front([float(f"{value:.1e}") for value in rows[error]], list(rows[cost]))]
 
 
 def pareto_charts(table: DataFrame, styles: Styles) -> list[Chart]:
     """Return a chart for each scene and each number of cells at which a method was swept."""
+    rows = succeeded(table)
+    sizes = rows.groupby("scene")["cells"].nunique()
     charts = []
-    for scene, rows in grouped(table, "scene").items():
-        sizes = grouped(succeeded(rows), "cells")
-        swept = {
-            cells: group
-            for cells, group in sizes.items()
-            if len(sizes) == 1 or group["label"].duplicated().any()
-        }
-        for cells, group in swept.items():
-            name = (
-                f"pareto_{scene}"
-                if len(swept) == 1
-                else f"pareto_{scene}_{formatting.plain(cells)}"
-            )
-            title = (
-                f"{SPEED_ACCURACY}: {scene}, {formatting.count(cells)} cells"
-                if cells > 0
-                else f"{SPEED_ACCURACY}: {scene}"
-            )
+    for (scene, cells), group in grouped(rows, "scene", "cells").items():
+        if sizes[scene] < 2 or group["label"].duplicated().any():
+            words = [f"{formatting.count(cells)} cells"] if cells > 0 else []
+            title = ", ".join([f"{SPEED_ACCURACY}: {scene}", *words])
+            name = f"pareto_{scene}_{formatting.plain(cells)}"
             charts.append(pareto_chart(name, title, group, styles))
     return [chart for chart in charts if chart.panels]
 
 
 def pareto_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Chart:
     """Return the chart of a scene, with a panel for each measure of error that has data."""
-    step = measured(rows, *STEP.columns)
+    step = measured(rows, *STEP)
     # only rows of equal time steps compare: take the time step with the most rows
     by_step = grouped(step, "time_step").values()
     step = max(
         by_step, key=lambda group: (len(group), group["time_step"].fillna(0).iloc[0]), default=step
     )
-    panels = [(STEP, step), (TRAJECTORY, measured(rows, *TRAJECTORY.columns))]
-    panels = [(measure, shown) for measure, shown in panels if len(shown)]
-    labels = dict.fromkeys(label for _, shown in panels for label in shown["label"])
+    panels = {STEP: step, TRAJECTORY: measured(rows, *TRAJECTORY)}
+    labels = dict.fromkeys(label for shown in panels.values() for label in shown["label"])
     legend = {label: styles[label] for label in labels} | {FRONT: CurveStyle(INK, RING)}
     chart = Chart(name, SPEED_ACCURACY, title, CAPTION, legend)
-    for measure, shown in panels:
-        draw_panel(chart, shown, measure)
+    for columns, shown in panels.items():
+        if len(shown):
+            draw_panel(chart, shown, columns)
     return chart
 
 
-def draw_panel(chart: Chart, rows: DataFrame, measure: ErrorMeasure) -> None:
+def draw_panel(chart: Chart, rows: DataFrame, columns: Columns) -> None:
     """Draw the Pareto front, a line through the best points of each method, other points hollow."""
-    step = formatting.worded("time_step", rows["time_step"].iloc[0])
-    at_step = f", time step {step}" if measure is STEP and step else ""
-    x = log_axis(measure.x_label, rows[measure.error], ERROR)
-    rows = rows.join(spread(rows, measure.cost))
-    y = log_axis(measure.y_label, rows[["least", "greatest", measure.cost]].to_numpy(), SECONDS)
-    panel = chart.panel(f"over the {measure.name}{at_step}", x, y)
-    front = front_rows(rows, measure)
+    title, x_title, y_title = TITLES[columns]
+    if columns == STEP and (step := formatting.worded("time_step", rows["time_step"].iloc[0])):
+        title += f", time step {step}"
+    error, cost = columns
+    rows = rows.join(spread(rows, cost))
+    x = log_axis(x_title, rows[error], ERROR)
+    y = log_axis(y_title, rows[["least", "greatest", cost]].to_numpy(), SECONDS)
+    panel = chart.panel(title, x, y)
+    front = front_rows(rows, columns)
     (_, right), (_, top) = x["scale"]["domain"], y["scale"]["domain"]
-    errors = list(front[measure.error])
-    costs = list(front[measure.cost])
+    errors, costs = list(front[error]), list(front[cost])
     panel.stair([errors[0], *errors, right], [top, *costs, costs[-1]])
-    best = concat([front_rows(group, measure) for group in grouped(rows, "label").values()])
-    columns = (*measure.columns, *TIP)
-    panel.whiskers(rows, measure.columns)
-    panel.mark(points(rows.drop(best.index), measure.columns, columns), hollow=True)
-    panel.curves(best, measure.columns, columns)
-    tied = [
-        index
-        for index, error in rows[measure.error].items()
-        if index in contenders(rows, measure, error).index
-    ]
-    panel.rings(rows.loc[front.index.union(tied)], measure.columns)
+    best = concat([front_rows(group, columns) for group in grouped(rows, "label").values()])
+    panel.whiskers(rows, columns)
+    panel.mark(points(rows.drop(best.index), columns, (*columns, *TIP)), hollow=True)
+    panel.curves(best, columns, (*columns, *TIP))
+    panel.rings(front, columns)
 
 
 # ---- surface error over cost
@@ -205,7 +163,7 @@ def size_charts(table: DataFrame, styles: Styles) -> list[Chart]:
 def draw_sizes(chart: Chart, scene: str, rows: DataFrame) -> None:
     """Draw the surface errors of a scene over cost and over cells."""
     y = log_axis("surface error", rows["surface_error"], ERROR)
-    over_cost = chart.panel(scene, log_axis(TRAJECTORY.y_label, rows["time_second"], SECONDS), y)
+    over_cost = chart.panel(scene, log_axis(COST, rows["time_second"], SECONDS), y)
     over_cost.rings(rows.iloc[front(list(rows["time_second"]), list(rows["surface_error"]))], SIZE)
     over_cells = chart.panel("", log_axis("valid cells", rows["cells"], COUNT), y)
     for panel, columns in ((over_cost, SIZE), (over_cells, ("cells", "surface_error"))):

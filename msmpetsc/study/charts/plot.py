@@ -235,10 +235,7 @@ class Chart:
 def legend(styles: Styles) -> dict[str, Any]:
     """Return an empty chart that shows the legend."""
     longest = max(map(len, styles), default=1)
-    fit = max(1, min(6, len(styles), int(WIDTH / (LETTER * longest + 40))))
-    lines = -(-len(styles) // fit)
-    # the fewest lines, filled evenly
-    shown = {"title": None, "columns": -(-len(styles) // lines)}
+    shown = {"title": None, "columns": max(1, int(WIDTH / (LETTER * longest + 40)))}
     channels = {"fill": nominal(styles, "color", shown), "shape": nominal(styles, "shape", shown)}
     values = [{"curve": name} for name in styles]
     mark = {"type": "point", "opacity": 0, "aria": False}

@@ -1,13 +1,12 @@
 """Stability maps: outcomes of each method over two axes, or over named cases."""
 
-import json
 import math
 from typing import Any, NamedTuple
 
 from pandas import DataFrame
 
 from msmpetsc.study import formatting
-from msmpetsc.study.charts.plot import INK, Axes, Chart, CurveStyle, channel, tips
+from msmpetsc.study.charts.plot import INK, Axes, Chart, CurveStyle, tips
 from msmpetsc.study.outcomes import MEANING, OUTCOMES
 from msmpetsc.study.table import Row, grouped, mapped, records
 
@@ -38,11 +37,10 @@ TIP = (
 
 
 class Scale(NamedTuple):
-    """An axis of a map: its values in order, and their labels."""
+    """An axis of a map: its name, and the label of each value in order."""
 
     name: str
-    values: tuple[str, ...]
-    texts: tuple[str, ...]
+    texts: dict[str, str]
 
 
 def entry(value: str, unit: str) -> str:
@@ -63,8 +61,8 @@ def scale(rows: DataFrame, column: str, axis: dict[str, Any]) -> Scale:
     listed = [str(float(value)) for value in axis.get("values", ())]
     measured = dict.fromkeys(rows[column])
     values = [value for value in dict.fromkeys([*listed, *measured]) if value in measured]
-    texts = [entry(value, axis.get("unit", "")) for value in values]
-    return Scale(axis.get("name", column), tuple(values), tuple(texts))
+    texts = {value: entry(value, axis.get("unit", "")) for value in values}
+    return Scale(axis.get("name", column), texts)
 
 
 def stability_charts(table: DataFrame, study: dict[str, Any]) -> list[Chart]:
@@ -86,75 +84,53 @@ def stability_chart(name: str, rows: DataFrame, settings: dict[str, Any]) -> Cha
     }
     title = settings.get("title") or name
     chart = Chart(f"stability_{name}", "Stability", title, CAPTION, legend, COLUMNS, gap=35)
-    chart.height = CELL * len(y.values)
+    chart.height = CELL * len(y.texts)
     by_label = grouped(rows, "label")
-    if set(x.values) == set(by_label):
-        draw_cells(
-            chart.panel("", *axes_of_cases(x, y)),
-            rows,
-            x._replace(name="method"),
-            y._replace(name="case"),
-        )
+    if set(x.texts) == set(by_label):
+        # named cases: methods along the top, cases downwards
+        across = axis(x, orient="top", labelAngle=-20, labelOverlap=False)
+        panel = chart.panel("", across, axis(y))
+        draw_cells(panel, rows, x._replace(name="method"), y._replace(name="case"))
         return chart
     for index, (label, group) in enumerate(by_label.items()):
         is_low = index + COLUMNS >= len(by_label)
-        panel = chart.panel(
-            label, axis(x, shown=is_low, labelAngle=-90), axis(y, shown=index % COLUMNS == 0)
-        )
-        draw_cells(panel, group, x, y)
+        is_left = index % COLUMNS == 0
+        across = axis(x, x.name if is_low else "", labels=is_low)
+        up = axis(y, y.name if is_left else "", labels=is_left)
+        up["scale"]["reverse"] = True
+        draw_cells(chart.panel(label, across, up), group, x, y)
     return chart
 
 
-def axis(scale: Scale, shown: bool = True, **more: Any) -> dict[str, Any]:
-    """Return an axis whose cells have width 1 around 0, 1, 2, ...; labelled if ``shown``."""
-    count = len(scale.values)
-    words = f"{json.dumps(scale.texts)}[datum.value]"
-    made = channel(scale.name if shown else "", words, range(count), domain=[-0.5, count - 0.5])
-    made["axis"] |= {"grid": False, "domain": False, "ticks": False, "labels": shown} | more
-    return made
-
-
-def axes_of_cases(x: Scale, y: Scale) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the axes of a map of named cases: methods along the top, cases downwards."""
-    broken = [
-        text.replace("-", "-\n").split("\n") if len(text) > 12 else [text] for text in x.texts
-    ]
-    room = 4 + 14 * (max(map(len, broken)) - 1)
-    across = axis(x, orient="top", labelOverlap=False, labelPadding=room)
-    down = axis(y)
-    across["axis"]["labelExpr"] = f"{json.dumps(broken)}[datum.value]"
-    down["scale"]["reverse"] = True
-    return across | {"title": ""}, down | {"title": ""}
+def axis(scale: Scale, title: str = "", **axis: Any) -> dict[str, Any]:
+    """Return an axis with a cell for each value."""
+    values = list(scale.texts.values())
+    plain = {"domain": False, "ticks": False}
+    return {
+        "type": "ordinal",
+        "title": title,
+        "scale": {"domain": values, "padding": 0.06},
+        "axis": plain | axis,
+    }
 
 
 def draw_cells(panel: Axes, rows: DataFrame, x: Scale, y: Scale) -> None:
     """Draw a coloured cell with its symbol and tooltip for each row."""
-    words = {
-        given.name: rows[column].map(dict(zip(given.values, given.texts, strict=True)))
-        for column, given in (("x", x), ("y", y))
-    }
-    placed = rows.assign(i=rows["x"].map(x.values.index), j=rows["y"].map(y.values.index), **words)
+    words = {x.name: rows["x"].map(x.texts), y.name: rows["y"].map(y.texts)}
+    placed = rows.assign(**words)
     values = [
         {
-            "x": row["i"] - 0.47, "x2": row["i"] + 0.47,
-            "y": row["j"] - 0.46, "y2": row["j"] + 0.46, "tip": tip,
-            "i": row["i"], "j": row["j"], "text": symbol(row), "color": COLORS[row["outcome"]],
-            "ink": "white" if row["outcome"] in DARK else INK,
+            "x": row[x.name], "y": row[y.name], "tip": tip, "text": symbol(row),
+            "color": COLORS[row["outcome"]], "ink": "white" if row["outcome"] in DARK else INK,
         }
         for row, tip in zip(records(placed), tips(placed, (*words, *TIP)), strict=True)
     ]  # fmt: skip
     # the columns contain colours, so Vega must not map them
     own = {"type": "nominal", "scale": None}
-    ends = {"x2": {"field": "x2"}, "y2": {"field": "y2"}}
-    panel.draw(
-        values,
-        {"type": "rect"},
-        fill={"field": "color"} | own,
-        description={"field": "tip"},
-        **ends,
-    )
-    text = {"text": {"field": "text"}, "x": {"field": "i"} | panel.x, "y": {"field": "j"} | panel.y}
-    panel.draw(values, {"type": "text", "fontSize": 10.5}, **text, color={"field": "ink"} | own)
+    fill = {"fill": {"field": "color"} | own, "description": {"field": "tip"}}
+    panel.draw(values, {"type": "rect"}, **fill)
+    text = {"text": {"field": "text"}, "color": {"field": "ink"} | own}
+    panel.draw(values, {"type": "text", "fontSize": 10.5}, **text)
 
 
 def symbol(row: Row) -> str:

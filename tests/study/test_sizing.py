@@ -31,7 +31,7 @@ from msmpetsc.study.sizing.choice import (
     tables,
 )
 from msmpetsc.study.sizing.orders import ORDERS, ErrorLaw, cosine_of, error_law
-from msmpetsc.study.sizing.trials import Asked, Sizer
+from msmpetsc.study.sizing.trials import Sizer
 from msmpetsc.study.table import Row
 
 STATIC = 'integrator = "static"'
@@ -93,9 +93,7 @@ def test_lattices_that_err_by_chance(order: float, cosine: float):
     assert cosine_of(first, second, across) == pytest.approx(cosine, abs=1e-6)
     law = error_law(sizes, [first, second], ORDERS, across, cosine)
     assert law.order == pytest.approx(order, abs=1e-6) and law.error(1) == pytest.approx(0.03)
-    assert law.measured(second, 1) == pytest.approx(e[1]) and law.measured_finer(
-        second, 1, 2
-    ) == pytest.approx(0.03)
+    assert law.measured(second, 1) == pytest.approx(e[1])
     assert error_law(sizes[1:], [second], (order, order)).error(1) > law.error(1)
     assert cosine_of(0, 1, 1) == 1
 
@@ -159,8 +157,8 @@ def sized(
     monkeypatch.setattr(
         trials, "surface_error", lambda a, b: bench.distance(bench.errors[a], bench.errors[b])
     )
-    asked = Asked(target, 10, cells, advised=advised)
-    return Sizer(tmp_path / "scene.toml", bench, asked, said.append).plan(), bench, said
+    asked = {"target": target, "frames": 10, "cells": cells, "advised": advised}
+    return Sizer(tmp_path / "scene.toml", bench, said.append, **asked).plan(), bench, said
 
 
 @pytest.mark.parametrize("explicit", [True, False])
@@ -269,18 +267,6 @@ def test_no_refusal_without_a_finer_lattice(tmp_path: Path, monkeypatch):
     assert max(each.cells for each in plan.tried) == round(6400 * 2**1.5)
 
 
-def test_orders_that_differ_are_assumed_to_be_their_mean(tmp_path: Path, monkeypatch):
-    """100, 800, 6,400 cells show order 1, and 800, 6,400, 18,102 the steepest order, 2.2."""
-    errors = {100: 0.2, 800: 0.1, 6400: 0.05, 18102: 0.043}
-
-    def by_cells(bench: Bodies, method: PlannedMethod, cells: int) -> float:
-        return errors.get(cells, 0.043)
-
-    monkeypatch.setattr(Bodies, "error_of", by_cells)
-    plan, _, _ = sized(tmp_path, monkeypatch, 0.01)
-    assert "the cells: their distances show no order; order 1.6 is assumed" in plan.bounds
-
-
 def test_a_choice_that_fails_is_not_made(tmp_path: Path, monkeypatch):
     """Verlet runs away on the chosen cells, though not on the cells tried before.
 
@@ -345,17 +331,11 @@ def test_a_plan_says_that_cells_end_inside_out(tmp_path: Path, monkeypatch):
         tmp_path, monkeypatch, 0.1, inverted=lambda cells: 7.0 if cells == 6400 else 0.0
     )
     order, motion = plan.bounds
-    assert "order 1 is assumed" in order and motion.endswith('"neo-hookean" may help')
+    assert "order 1 is assumed" in order and motion.endswith("fewer --frames may help")
     without, _, _ = sized(
         tmp_path, monkeypatch, 0.1, inverted=lambda cells: 7.0 if cells < 6400 else 0.0
     )
     assert without.bounds == [] and plan.choice.cells >= without.choice.cells
-
-
-def test_a_law_is_not_advised_to_a_scene_that_has_it(tmp_path: Path, monkeypatch):
-    monkeypatch.setattr(sys.modules[__name__], "SCENE", SCENE.replace("linear", "neo-hookean"))
-    plan, _, _ = sized(tmp_path, monkeypatch, 0.1, inverted=lambda cells: 7.0)
-    assert plan.bounds[-1].endswith("fewer --frames may help")
 
 
 def test_runs_that_fail_are_told_and_end_the_plan_in_a_line(tmp_path: Path, monkeypatch):
@@ -365,13 +345,13 @@ def test_runs_that_fail_are_told_and_end_the_plan_in_a_line(tmp_path: Path, monk
         bench, "measure", lambda case, keep: {"status": "failed", "reason": "planted"}
     )
     (tmp_path / "scene.toml").write_text(SCENE)
-    sizer = Sizer(tmp_path / "scene.toml", bench, Asked(0.1, 10, None), said.append)
+    sizer = Sizer(tmp_path / "scene.toml", bench, said.append, target=0.1, frames=10)
     with pytest.raises(InputError, match="the trials failed"):
         sizer.plan()
     assert all("planted" in text for text in said) and len(said) == 2
     (tmp_path / "scene.toml").write_text(SCENE.replace("count = 10", "cell_size = 0.1"))
     with pytest.raises(InputError, match="--cells N says how many"):
-        Sizer(tmp_path / "scene.toml", bench, Asked(0.1, 10), print)
+        Sizer(tmp_path / "scene.toml", bench, print, target=0.1, frames=10)
 
 
 def true_error(scene: Path, *, choice: list[str], finer: list[str]) -> float:

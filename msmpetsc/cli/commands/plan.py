@@ -27,7 +27,7 @@ from msmpetsc.study.sizing.choice import (
     put_into,
     tables,
 )
-from msmpetsc.study.sizing.trials import Asked, Sizer
+from msmpetsc.study.sizing.trials import Sizer
 
 NOTHING_MEETS = 3
 HEAD = f"{'integrator':16} {'time error':>10} {'step error':>10} {'cells':>8} {'cost [s/s]':>10}"
@@ -71,13 +71,15 @@ def size_all(args: argparse.Namespace, target: float) -> SizePlan:
     scene = load_scene(args.scene)
     bodies = read_bodies(MPI.COMM_SELF, scene)
     advised = estimated_cells(bodies, advised_size(bodies, scene.material.law))
-    asked = Asked(target, args.frames, args.cells, args.ranks, advised)
     with (
         tempfile.TemporaryDirectory(prefix="msmpetsc-plan-") as folder,
         closing(Processes()) as processes,
     ):
         runs = Bench(Path(folder), processes)
-        sizer = Sizer(args.scene, runs, asked, print_size_trial)
+        sizer = Sizer(
+            args.scene, runs, print_size_trial, target=target, frames=args.frames,
+            cells=args.cells, ranks=args.ranks, advised=advised,
+        )  # fmt: skip
         print(HEAD, flush=True)
         return sizer.plan()
 

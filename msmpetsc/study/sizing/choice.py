@@ -1,6 +1,6 @@
 """The choice of a plan: integrator, target errors and cells; and the scene file that gets them."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -84,21 +84,6 @@ class SizePlan:
     met: bool
     bounds: list[str] = field(default_factory=list)
     tried: list[SizeTrial] = field(default_factory=list)
-
-
-def inverted_bound(trials: Sequence[SizeTrial], law: str) -> list[str]:
-    """Return a note if cells of the finest lattice are inverted, because convergence may fail."""
-    finest = max(trials, key=lambda each: each.cells)
-    if not finest.inverted:
-        return []
-    helps = "fewer --frames"
-    if law == "linear":
-        helps += ' or material.law = "neo-hookean"'
-    inverted = (
-        f"of {finest.cells:.0f} cells {finest.inverted:.0f} end inside out, "
-        "each lattice in its own way"
-    )
-    return [f"the motion: {inverted}; {helps} may help"]
 
 
 # ---- the answer as changes of a scene file

@@ -63,10 +63,6 @@ class ErrorLaw:
         error = self.error(finer)
         return math.sqrt(distance**2 + error**2 + 2 * self.cosine * distance * error)
 
-    def measured_finer(self, distance: float, size: float, coarser: float) -> float:
-        """Return the error of a run of this size from its distance to a run of size ``coarser``."""
-        return _finer_error(distance, (coarser / size) ** self.order, self.cosine)
-
 
 def _finer_error(distance: float, ratio: float, cosine: float) -> float:
     """Return e_b from d, e_a / e_b and c."""

@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
 
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
@@ -20,7 +19,6 @@ from msmpetsc.study.sizing.choice import (
     PlannedMethod,
     SizePlan,
     SizeTrial,
-    inverted_bound,
     tables,
 )
 from msmpetsc.study.sizing.orders import ORDERS, ErrorLaw, cosine_of, error_law
@@ -29,8 +27,6 @@ from msmpetsc.study.sizing.orders import ORDERS, ErrorLaw, cosine_of, error_law
 REFINEMENT = 2
 # powers of REFINEMENT by which the coarsest lattice is coarsened; the first that runs
 COARSEST_POWERS = (2.0, 5 / 3, 4 / 3)
-# ratio of cells below which the distance of a finer to a coarser lattice is random
-DISTINCT_CELLS = 4
 # least cells of the finest lattice in the first round
 START_CELLS = 1000
 # target / error of the motion by implicit steps; so that cells have most of the target
@@ -39,21 +35,15 @@ STEP_MARGIN = 8
 OUT_OF_PHASE = 0.15
 # order assumed if lattices show none; clamped bars show 1.5 to 2
 USUAL_ORDER = 1.5
-# difference of the orders of coarser and finer lattices above which one is chance
-ALIKE = 0.5
 # time limits of a trial on coarse lattices and on the finest [s]
 TIMEOUT, FINEST_TIMEOUT = 150.0, 900.0
 MAX_CHOICES = 6
-# ratio of most to least cells at which the search for cells ends
-NARROW = 1.05
-# error / target above which the finest lattice is refined if its order is uncertain
-UNCERTAIN = 1 / 3
 # error / target that a choice aims at, and the least that ends the search
 AIM, ACCEPTED = 0.9, 0.75
 
 
-class Asked(NamedTuple):
-    """The request of a plan.
+class Sizer:
+    """Planner that runs trials of a scene for a surface error and reports each of them.
 
     target  : largest surface error [-]
     frames  : number of frames, from the scene's first, that the trials run
@@ -61,41 +51,39 @@ class Asked(NamedTuple):
     advised : cells on which the thin tenth of each body bends enough
     """
 
-    target: float
-    frames: int
-    cells: int | None = None
-    ranks: int = 1
-    advised: float = 0.0
-
-
-class Sizer:
-    """Planner that runs trials of a scene for a surface error and reports each of them."""
-
     def __init__(
-        self, scene: Path, bench: Bench, asked: Asked, report: Callable[[SizeTrial | str], None]
+        self,
+        scene: Path,
+        bench: Bench,
+        report: Callable[[SizeTrial | str], None],
+        *,
+        target: float,
+        frames: int,
+        cells: int | None = None,
+        ranks: int = 1,
+        advised: float = 0.0,
     ):
         self.scene = scene
         self.bench = bench
-        self.target = asked.target
-        self.ranks = asked.ranks
+        self.target = target
+        self.ranks = ranks
         self.as_given = load_scene(scene)
-        count = asked.cells or self.as_given.cages.count
+        count = cells or self.as_given.cages.count
         if count is None:
             raise InputError(
                 f"{scene} has cages.cell_size: --cells N says how many cells the finest trial has"
             )
         self.cells = count
         self.report = report
-        self.advised = asked.advised
+        self.advised = advised
         self.step = self.as_given.time.step
         self.is_static = self.as_given.time.integrator == STATIC
-        self.duration = self.step * min(asked.frames, self.as_given.time.steps)
+        self.duration = self.step * min(frames, self.as_given.time.steps)
         # step error of all runs
         self.solved = min(1e-3, self.target / 10)
         # whether verlet may be chosen
         self.explicit = True
         self.bounds: list[str] = []
-        self.cell_bound = ""
         self.trials: list[SizeTrial] = []
 
     @property
@@ -124,18 +112,14 @@ class Sizer:
         law = self._law(lattices)
         wanted = fewest_cells(law, AIM * self.target - time_error)
         finest = lattices[-1]
-        # a choice this near the finest lattice cannot be measured from it
-        is_near = finest.cells / 2 < wanted < DISTINCT_CELLS * finest.cells
-        # the order determines the error of the finest lattice, which enters all errors
-        is_uncertain = not law.observed or _distance(lattices[0], lattices[1]) > OUT_OF_PHASE
-        is_too_coarse = law.error(finest.edge) > UNCERTAIN * self.target
-        # few cells cannot show that no number of cells is enough
-        if (wanted > self.most or is_near or (is_uncertain and is_too_coarse)) and (
-            finer := self._run(method, self._coarser(-0.5))
-        ):
+        # a choice cannot be measured from a lattice that is hardly finer
+        if wanted > finest.cells / 2 and (finer := self._run(method, self._coarser(-0.5))):
             lattices = [*lattices[-2:], finer]
-            law = self._law(lattices, law)
+            law = self._law(lattices)
         plan = self._refine_choice(method, time_error, law, lattices)
+        if plan is None:
+            self.explicit = False
+            return self._plan_on_lattices()
         return replace(plan, bounds=self._bounds(plan, law), tried=self.trials)
 
     # ---- integrator
@@ -193,44 +177,26 @@ class Sizer:
             )
         return list(runs.values())
 
-    def _law(self, runs: list[SizeTrial], coarser: ErrorLaw | None = None) -> ErrorLaw:
+    def _law(self, runs: list[SizeTrial]) -> ErrorLaw:
         """Return the law of the cells' error from runs on two or three lattices.
 
-        If they show no order, the order of coarser lattices is assumed, or the usual order if these
-        show none. If both differ, one of them is chance, and their mean is assumed. If cells are
-        inverted, order 1 is assumed: the inverted region shrinks no faster than the edge of a cell.
-
-        coarser : law of coarser lattices
+        If they show no order, the usual order is assumed. If cells are inverted, order 1 is
+        assumed: the inverted region shrinks no faster than the edge of a cell.
         """
         distances = [_distance(*pair) for pair in pairwise(runs)]
-        least, greatest = ORDERS
-        is_out_of_phase = len(runs) > 2 and distances[0] > OUT_OF_PHASE
-        is_inverted = runs[-1].inverted > 0
-        known = coarser.order if coarser and coarser.observed else None
-        orders, assumed = (USUAL_ORDER if is_out_of_phase else least, greatest), known
-        if is_inverted:
-            orders, assumed, known = (least, least), least, None
         across = _distance(runs[0], runs[-1])
         cosine = cosine_of(distances[0], distances[1], across) if len(runs) > 2 else 0.0
-        edges = [each.edge for each in runs]
-        law = error_law(
-            edges,
-            distances,
-            orders,
-            None if is_out_of_phase else across,
-            cosine,
-            assumed or USUAL_ORDER,
-        )
-        if known and law.observed and abs(law.order - known) > ALIKE:
-            mean = (law.order + known) / 2
-            law = error_law((edges[0], edges[-1]), (across,), ORDERS, None, cosine, mean)
-        law = replace(law, observed=law.observed and not is_inverted)
-        self.cell_bound = ""
-        if not law.observed:
-            self.cell_bound = (
-                f"the cells: their distances show no order; order {law.order:.2g} is assumed"
-            )
-        return law
+        is_out_of_phase = len(runs) > 2 and distances[0] > OUT_OF_PHASE
+        is_inverted = runs[-1].inverted > 0
+        least, greatest = ORDERS
+        orders = (USUAL_ORDER if is_out_of_phase else least, greatest)
+        edges = [run.edge for run in runs]
+        known = None if is_out_of_phase else across
+        if is_inverted:
+            law = error_law(edges, distances, (least, least), known, cosine)
+        else:
+            law = error_law(edges, distances, orders, known, cosine, USUAL_ORDER)
+        return replace(law, observed=law.observed and not is_inverted)
 
     def _coarser(self, power: float) -> int:
         """Return the cells of the lattice whose edges are REFINEMENT^power times as long."""
@@ -239,11 +205,11 @@ class Sizer:
 
     def _refine_choice(
         self, method: PlannedMethod, time_error: float, law: ErrorLaw, lattices: Sequence[SizeTrial]
-    ) -> SizePlan:
+    ) -> SizePlan | None:
         """Choose, run and measure until the error is a little less than the target.
 
         Each choice lies between cells that met the target and cells that did not, because the error
-        is not monotonic in the cells.
+        is not monotonic in the cells. Returns None if verlet fails on finer cells.
         """
         finest = lattices[-1]
         met = None
@@ -253,22 +219,24 @@ class Sizer:
         coarse: list[tuple[float, float]] = []
         least, most = 1, self.most
         for _ in range(MAX_CHOICES):
-            wanted = (fewest_cells(law, share * self.target - time_error) for share in (AIM, 1))
-            cells = next((max(least, cells) for cells in wanted if cells <= most), math.inf)
-            if cells > most:
+            wanted = fewest_cells(law, AIM * self.target - time_error)
+            if wanted > most:
                 break
-            cells = int(cells)
+            cells = max(least, int(wanted))
             run = self._run(method, cells)
             if run is None:
                 if cells < lattices[0].cells:
                     least = math.ceil(lattices[0].cells)
                     continue
                 self.bounds.append(f"the step: {method.integrator} fails on finer cells")
-                if method.integrator != "verlet":
-                    break
-                self.explicit = False
-                return self._plan_on_lattices()
-            measured = Budget(self._cells_error(run, finest, law), time_error)
+                if method.integrator == "verlet":
+                    return None
+                break
+            of_cells = law.error(run.edge)
+            if run.cells <= finest.cells:
+                # the same method, so that only the cells differ
+                of_cells = law.measured(_distance(run, finest), finest.edge)
+            measured = Budget(of_cells, time_error)
             error = measured.total / self.target
             if error <= 1:
                 met = Choice(method, cells, measured, run.cost)
@@ -277,7 +245,7 @@ class Sizer:
             else:
                 coarse = [(run.edge, measured.cells)]
                 least = cells + 1
-            if ACCEPTED <= error <= 1 or least > most / NARROW:
+            if ACCEPTED <= error <= 1 or least > most:
                 break
             self.report(f"{cells} cells: {measured.total:.1e}, chosen once more")
             law = law.through(*coarse, *fine)
@@ -285,24 +253,19 @@ class Sizer:
         cost = finest.cost * self.most / finest.cells
         return SizePlan(met or Choice(method, self.most, budget, cost), met is not None)
 
-    def _cells_error(self, run: SizeTrial, finest: SizeTrial, law: ErrorLaw) -> float:
-        """Return the error of a run's cells, from its distance to the finest lattice.
-
-        If the run is a little finer than the finest lattice, their distance is random and the
-        expected error stands.
-        """
-        if 1 < run.cells / finest.cells < DISTINCT_CELLS:
-            return law.error(run.edge)
-        # the same method, so that only the cells differ
-        distance = _distance(run, finest)
-        if run.edge < finest.edge:
-            return law.measured_finer(distance, run.edge, finest.edge)
-        return law.measured(distance, finest.edge)
-
     def _bounds(self, plan: SizePlan, law: ErrorLaw) -> list[str]:
         """Return the reasons why the error of a plan is not smaller, or not certain."""
-        bounds = [*self.bounds, *filter(None, [self.cell_bound])]
-        bounds += inverted_bound(self.trials, self.as_given.material.law)
+        bounds = [*self.bounds]
+        if not law.observed:
+            bounds.append(
+                f"the cells: their distances show no order; order {law.order:.2g} is assumed"
+            )
+        finest = max(self.trials, key=lambda trial: trial.cells)
+        if finest.inverted:
+            bounds.append(
+                f"the motion: of {finest.cells:.0f} cells {finest.inverted:.0f} end inside out, "
+                "each lattice in its own way; fewer --frames may help"
+            )
         if plan.choice.cells < self.advised:
             bounds.append(
                 f"the cells: on {plan.choice.cells} cells a tenth of a body bends too little; "

@@ -5,7 +5,7 @@ import json
 import math
 import os
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -104,12 +104,15 @@ class Case:
         return replace(self, set=(*self.set, *changes))
 
 
-def run_arguments(case: Case) -> list[str]:
-    """Return the command line arguments of ``msmpetsc`` for a case, without output options."""
+def run_arguments(case: Case, *output: str) -> list[str]:
+    """Return the command line arguments of ``msmpetsc`` for a case.
+
+    PETSc's options come last, because a flag without a value would take the next word as its value.
+    """
     changes = [word for change in case.set for word in ("--set", change)]
     if case.true_error is not None:
         changes += ["--true-error", str(case.true_error)]
-    return ["run", os.path.relpath(case.file), *changes, *shlex.split(case.options)]
+    return ["run", os.path.relpath(case.file), *output, *changes, *shlex.split(case.options)]
 
 
 def launcher(ranks: int) -> list[str]:
@@ -118,13 +121,9 @@ def launcher(ranks: int) -> list[str]:
 
 
 def command(case: Case, result: Path, measure: Path) -> list[str]:
-    """Return the command of a run that writes its frames to ``result``, its costs to ``measure``.
-
-    PETSc's options come last, because a flag without a value would take the next word as its value.
-    """
-    name, scene, *rest = run_arguments(case)
-    outputs = ["-o", str(result), "--overwrite", "--measure", str(measure)]
-    return [*launcher(case.ranks), *PROGRAM, name, scene, *outputs, *rest]
+    """Return the command of a run that writes ``result`` and its costs, ``measure``."""
+    output = ("-o", str(result), "--overwrite", "--measure", str(measure))
+    return [*launcher(case.ranks), *PROGRAM, *run_arguments(case, *output)]
 
 
 def shown_command(case: Case) -> str:
@@ -141,36 +140,24 @@ def digest(file: Path, scene: Scene) -> str:
     ).hexdigest()[:16]
 
 
-def scene_tables(values: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Return a case's values as the scene tables "time" and "solver"; None stands for no key.
-
-    Verlet has no solver table. Implicit Euler is the default, so its name is left out.
-    """
-    values = {
-        **values,
-        "integrator": None if values["integrator"] == "implicit-euler" else values["integrator"],
-    }
-    names = ("time",) if values["integrator"] == "verlet" else ("time", "solver")
-    tables: dict[str, dict[str, Any]] = {name: {} for name in names}
-    for name, (table, key) in OVERRIDES.items():
-        if table in tables and name in values:
-            tables[table][key] = values[name]
-    return tables
-
-
 def with_tables(
     case: Case, duration: float, every: int, scene: Scene, surface: bool = False
 ) -> Case:
-    """Return a case with the overrides of its solver, time and output tables."""
-    tables = scene_tables(vars(case))
-    time = (
-        scene.time.model_dump(exclude_unset=True)
-        | {"step": case.time_step, "duration": duration}
-        | tables["time"]
-    )
-    solver = [f"solver={toml_value(tables['solver'])}"] if "solver" in tables else []
+    """Return a case with the overrides of its time, solver and output tables.
+
+    Verlet has no solver table.
+    """
+    tables: dict[str, dict[str, Any]] = {
+        "time": scene.time.model_dump(exclude_unset=True) | {"duration": duration},
+        "solver": {},
+    }
+    for name, (table, key) in OVERRIDES.items():
+        tables[table][key] = getattr(case, name)
+    if case.integrator == "verlet":
+        del tables["solver"]
     case = case.changed(
-        *solver, f"time={toml_value(time)}", SURFACE if surface else "output.surface=false"
+        *(f"{name}={toml_value(table)}" for name, table in tables.items()),
+        SURFACE if surface else "output.surface=false",
     )
     return case.changed(f"output.every={every}") if every > 1 else case
 
@@ -196,11 +183,6 @@ def study_cases(study: Study, folder: Path, full: bool) -> list[Case]:
         for case in map_cases(study, map, folder) if full or not map.full else ():
             by_id.setdefault(case.id, case)
     return list(by_id.values())
-
-
-def combinations(lists: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]:
-    """Yield the Cartesian product of named lists as dictionaries; the last list varies fastest."""
-    return (dict(zip(lists, values, strict=True)) for values in product(*lists.values()))
 
 
 def with_laws(scene: StudyScene, sweep: Sweep) -> Iterator[tuple[StudyScene, Sweep]]:
@@ -247,7 +229,9 @@ def _methods(base: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> It
         ]
         presets = sweep.presets or (as_given.solver.preset,)
         lists = {"preset": presets, "options": sweep.options, "time_step": steps, "goal": goals}
-    for values in combinations(lists | {"ranks": sweep.ranks}):
+    lists["ranks"] = sweep.ranks
+    for choice in product(*lists.values()):
+        values = dict(zip(lists, choice, strict=True))
         case = replace(base, **values.pop("goal", {}), **values)
         yield _timed(replace(case, label=_label(sweep, case)), scene, sweep, as_given)
 
@@ -271,7 +255,7 @@ def _timed(case: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Case
     case = replace(case, true_error=case.true_error and min(case.true_error, steps))
     every = 1
     if case.reference is not None:
-        every = max(1, round((scene.frame or as_given.time.step) / case.time_step))
+        every = max(1, round(as_given.time.step / case.time_step))
     surface = case.reference is not None and case.reference.stores_surface
     return with_tables(case, duration, every, as_given, surface)
 
@@ -292,8 +276,8 @@ def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
         )
     if reference.law:
         base = base.changed(f"material.law={reference.law}")
-    frame = scene.frame or as_given.time.step
-    duration = scene.seconds(as_given.time.step, as_given.time.duration)
+    frame = as_given.time.step
+    duration = scene.seconds(frame, as_given.time.duration)
     case = replace(
         base,
         integrator=reference.integrator,
@@ -310,7 +294,8 @@ def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
     every = round(frame / step)
     if every < 1 or not math.isclose(every * step, frame, rel_tol=1e-6):
         raise InputError(
-            f"scene {base.scene}: frame = {frame:g} s is no multiple of reference.step = {step:g} s"
+            f"scene {base.scene}: time.step = {frame:g} s "
+            f"is no multiple of reference.step = {step:g} s"
         )
     case = replace(case, time_step=step, preset=reference.preset, error=reference.error)
     return with_tables(case, duration, every, as_given, surface)

@@ -113,14 +113,12 @@ class Length(Table):
 class StudyScene(Length):
     """A scene of the study, with its length, reference and measurements.
 
-    frame      : time [s] between comparisons with the reference; the scene's time step if absent
     true_error : number of steps between measurements of the true step error
     """
 
     name: Name
     file: FileName
     set: ListOf[Override] = ()
-    frame: Positive | None = None
     reference: ReferenceRun | None = None
     true_error: Count | None = None
     full: bool = False

@@ -87,7 +87,7 @@ def test_a_sweep_is_a_product(tmp_path: Path):
     for told in (
         "cages.count=20",
         'preset = "anderson", max_iterations = 5',
-        "step = 0.02, duration = 0.1",
+        'step = 0.02, duration = 0.1, integrator = "implicit-euler"',
     ):
         assert told in last
 

@@ -24,9 +24,9 @@ def test_the_table_says_what_the_runs_said(tmp_path: Path, stand_in):
     text = (
         "repeats = 3\n"
         + ONE_SCENE
-        + 'frame = 0.02\nreference = { integrator = "implicit-euler", step = 0.001 }\n'
+        + 'set = ["time.step=0.02"]\nreference = { integrator = "implicit-euler", step = 0.001 }\n'
     )
-    text += '[[sweep]]\npresets = ["newton"]\nerrors = [0.1]\nranks = [2]'
+    text += '[[sweep]]\npresets = ["newton"]\ntime_steps = [0.01]\nerrors = [0.1]\nranks = [2]'
     (row,) = carry_out(tmp_path, text)
     assert set(row) == set(COLUMNS)
     # run 1 is the reference, 2, 3 and 4 are the repeats

@@ -442,7 +442,8 @@ def test_what_is_written_into_a_scene_keeps_its_comments(tmp_path: Path):
     path = tmp_path / "scene.toml"
     path.write_bytes(COMMENTED.replace("\n", "\r\n").encode())
     put_into(path, tables(PlannedMethod("implicit-euler", 0.005, 1e-2)))
-    expected = COMMENTED.replace("= 1.0\n", "= 1.0\nerror = 0.005\n").replace("anderson", "newton")
+    time = 'integrator = "implicit-euler"\nerror = 0.005\n'
+    expected = COMMENTED.replace("= 1.0\n", f"= 1.0\n{time}").replace("anderson", "newton")
     expected = expected.replace("max_iterations = 5", "error = 0.01").replace("\n", "\r\n")
     assert path.read_bytes().decode() == expected
     put_into(path, tables(PlannedMethod("verlet")))

@@ -11,10 +11,6 @@ from msmpetsc.results.disk import write_whole
 from msmpetsc.scene.reading import read_toml
 from msmpetsc.scene.toml import toml_value
 from msmpetsc.scene.values import IntegratorName
-from msmpetsc.study.cases import scene_tables
-
-# solver preset of implicit methods; it chooses the preconditioner itself
-PRESET = "newton"
 
 
 @dataclass(frozen=True)
@@ -94,11 +90,12 @@ Tables = Mapping[str, Mapping[str, Any]]
 
 def tables(method: PlannedMethod) -> dict[str, dict[str, Any]]:
     """Return the tables of a scene that a method determines; None stands for no key."""
-    values: dict[str, Any] = {"integrator": method.integrator, "substep": None}
-    values |= {"preset": PRESET, "error": method.step_error, "max_iterations": None}
-    made = scene_tables(values)
-    made["time"]["error"] = method.time_error
-    return made
+    time = {"integrator": method.integrator, "error": method.time_error, "substep": None}
+    if method.integrator == "verlet":
+        return {"time": time}
+    # the preset chooses the preconditioner itself
+    solver = {"preset": "newton", "error": method.step_error, "max_iterations": None}
+    return {"time": time, "solver": solver}
 
 
 def overrides(scene: Path, tables: Tables) -> list[str]:

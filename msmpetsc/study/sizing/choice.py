@@ -101,17 +101,11 @@ def tables(method: PlannedMethod) -> dict[str, dict[str, Any]]:
 def overrides(scene: Path, tables: Tables) -> list[str]:
     """Return changes of a scene file as arguments of --set. Raises InputError."""
     _, document = read_toml(scene)
-    changes = []
-    for name, table in tables.items():
-        given = document.get(name, {})
-        if any(value is None and key in given for key, value in table.items()):
-            # --set cannot remove a key, so the whole table is replaced
-            changes.append(f"{name}={toml_value({**given, **table})}")
-        else:
-            changes += [
-                f"{name}.{key}={value}" for key, value in table.items() if value is not None
-            ]
-    return changes
+    # --set cannot remove a key, so whole tables are replaced
+    return [
+        f"{name}={toml_value({**document.get(name, {}), **table})}"
+        for name, table in tables.items()
+    ]
 
 
 def put_into(scene: Path, tables: Tables) -> None:

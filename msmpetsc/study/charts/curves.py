@@ -32,7 +32,7 @@ SPEED_ACCURACY = "Speed against accuracy"
 FRONT = "Pareto front"
 CAPTION = (
     "Lower is faster, further left is more exact. A line joins the Pareto-optimal points of a "
-    "method; its other points are small and hollow. A point is the median of the repeats; whiskers "
+    "method; its other points lie beside it. A point is the median of the repeats; whiskers "
     "reach from the least to the greatest, and points whose whiskers overlap may cost the same. "
     "Rings and the grey stair are the Pareto front: no measured case is both cheaper and more "
     "exact, with errors compared to two digits. The "
@@ -112,7 +112,7 @@ def pareto_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Char
 
 
 def draw_panel(chart: Chart, rows: DataFrame, columns: Columns) -> None:
-    """Draw the Pareto front, a line through the best points of each method, other points hollow."""
+    """Draw the Pareto front, a line through the best points of each method, and all points."""
     title, x_title, y_title = TITLES[columns]
     if columns == STEP and (step := formatting.worded("time_step", rows["time_step"].iloc[0])):
         title += f", time step {step}"
@@ -127,8 +127,8 @@ def draw_panel(chart: Chart, rows: DataFrame, columns: Columns) -> None:
     panel.stair([errors[0], *errors, right], [top, *costs, costs[-1]])
     best = concat([front_rows(group, columns) for group in grouped(rows, "label").values()])
     panel.whiskers(rows, columns)
-    panel.mark(points(rows.drop(best.index), columns, (*columns, *TIP)), hollow=True)
-    panel.curves(best, columns, (*columns, *TIP))
+    panel.line(points(best, columns, ()))
+    panel.mark(points(rows, columns, (*columns, *TIP)))
     panel.rings(front, columns)
 
 
@@ -167,7 +167,9 @@ def draw_sizes(chart: Chart, scene: str, rows: DataFrame) -> None:
     over_cost.rings(rows.iloc[front(list(rows["time_second"]), list(rows["surface_error"]))], SIZE)
     over_cells = chart.panel("", log_axis("valid cells", rows["cells"], COUNT), y)
     for panel, columns in ((over_cost, SIZE), (over_cells, ("cells", "surface_error"))):
-        panel.curves(rows, columns, (*columns[::-1], "cells", "time_step", "error"))
+        values = points(rows, columns, (*columns[::-1], "cells", "time_step", "error"))
+        panel.line(values)
+        panel.mark(values)
 
 
 # ---- growth with the number of cells, as in the paper's Figure 6
@@ -256,5 +258,7 @@ def growth_chart(name: str, title: str, rows: DataFrame) -> Chart:
         panel = chart.panel(title, x, log_axis("", shown[drawn].to_numpy(), words))
         if timed:
             panel.whiskers(shown, ("cells", column))
-        panel.curves(shown, ("cells", column), ("cells", column, *GROWTH_TIP))
+        values = points(shown, ("cells", column), ("cells", column, *GROWTH_TIP))
+        panel.line(values)
+        panel.mark(values)
     return chart

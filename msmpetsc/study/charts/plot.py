@@ -144,33 +144,16 @@ class Axes:
         bar = {"type": "errorbar", "ticks": part | {"size": 7}, "rule": part}
         self.draw(values, bar, y2={"field": "high"}, color=nominal(self.styles, "color"))
 
-    def curves(self, rows: DataFrame, columns: Columns, names: Iterable[str]) -> None:
-        """Draw each curve's rows, in their order, as a line with a marker at each point."""
-        values = points(rows, columns, names)
-        self.line(values)
-        self.mark(values)
-
     def line(self, values: list[dict[str, Any]], **mark: Any) -> None:
         """Draw a line through the values of each curve, in their order."""
         line = {"type": "line", "strokeWidth": 1.6} | mark
         self.draw(values, line, order={"value": None}, color=nominal(self.styles, "color"))
 
-    def mark(self, values: list[dict[str, Any]], hollow: bool = False) -> None:
-        """Draw a marker with a tooltip for each value from ``points``, small if ``hollow``."""
-        color = nominal(self.styles, "color")
-        own = {"fill": color}
-        mark: dict[str, Any] = {
-            "type": "point",
-            "size": MARKER,
-            "stroke": "white",
-            "strokeWidth": 0.6,
-        }
-        if hollow:
-            own = {"stroke": color}
-            mark = {"type": "point", "size": 35, "fill": "white", "strokeWidth": 0.6}
-        self.draw(
-            values, mark, shape=nominal(self.styles, "shape"), description={"field": "tip"}, **own
-        )
+    def mark(self, values: list[dict[str, Any]]) -> None:
+        """Draw a marker with a tooltip for each value from ``points``."""
+        mark = {"type": "point", "size": MARKER, "stroke": "white", "strokeWidth": 0.6}
+        shape, color = nominal(self.styles, "shape"), nominal(self.styles, "color")
+        self.draw(values, mark, shape=shape, fill=color, description={"field": "tip"})
 
     def rings(self, rows: DataFrame, columns: Columns) -> None:
         """Draw a ring around each row."""

@@ -62,19 +62,6 @@ def test_an_order_that_cannot_be_is_not_believed():
     assert not two.observed and two.error(1) == pytest.approx(0.05)
 
 
-def test_without_an_order_two_sizes_alike_tell_less_than_two_far_apart():
-    """Errors go as the size, but for 0.02 of chance, which the last two sizes alone would make much
-    of."""
-    sizes, errors = (4, 1.4, 1), (0.4, 0.16, 0.08)
-    near = error_law(sizes, [0.24, 0.08], ORDERS)
-    wide = error_law(sizes, [0.24, 0.08], ORDERS, across=errors[0] - errors[2])
-    assert not near.observed and near.error(1) == pytest.approx(0.2)
-    assert not wide.observed and wide.error(1) == pytest.approx(0.32 / 3)
-    assert error_law((4, 2, 1), [0.05, 0.05], ORDERS, across=0.1).error(1) == pytest.approx(0.05)
-    seen = [0.03 * (4**1.5 - 1.4**1.5), 0.03 * (1.4**1.5 - 1)]
-    assert error_law(sizes, seen, ORDERS, across=1.0).error(1) == pytest.approx(0.03)
-
-
 def test_an_error_that_jumps_between_two_like_sizes_has_a_law():
     """Its order would be 618, and 0.2^618 underflows."""
     jump = ErrorLaw(1.0, 1.5).through((0.2, 0.5), (0.198, 0.001))
@@ -91,7 +78,7 @@ def test_lattices_that_err_by_chance(order: float, cosine: float):
     first, second = (math.sqrt(a**2 - (1 - cosine**2) * b**2) - cosine * b for a, b in pairwise(e))
     across = math.sqrt(first**2 + second**2 + 2 * cosine * first * second)
     assert cosine_of(first, second, across) == pytest.approx(cosine, abs=1e-6)
-    law = error_law(sizes, [first, second], ORDERS, across, cosine)
+    law = error_law(sizes, [first, second], ORDERS, cosine)
     assert law.order == pytest.approx(order, abs=1e-6) and law.error(1) == pytest.approx(0.03)
     assert law.measured(second, 1) == pytest.approx(e[1])
     assert error_law(sizes[1:], [second], (order, order)).error(1) > law.error(1)

@@ -18,8 +18,6 @@ from scipy.optimize import brentq
 
 # range of orders accepted: 1 for partly filled boundary cells, 2 for linear cells
 ORDERS = (1.0, 2.2)
-# ratio of sizes below which a random part hides the order
-SIMILAR_RATIO = 1.9
 # steepest order through two runs [-]; so that powers of sizes stay finite
 STEEPEST = 100.0
 # distance of a measured order below the range at which it still counts as observed
@@ -80,7 +78,6 @@ def error_law(
     sizes: Sequence[float],
     distances: Sequence[float],
     orders: tuple[float, float],
-    across: float | None = None,
     cosine: float = 1.0,
     assumed: float | None = None,
 ) -> ErrorLaw:
@@ -89,8 +86,6 @@ def error_law(
     sizes     : two or three sizes, descending
     distances : distances between consecutive runs
     orders    : least and greatest order accepted
-    across    : distance between the first and the last run; it replaces the last of ``distances``
-                if no order is observed and the last two sizes are similar
     cosine    : cosine c of the angle between distance and error
     assumed   : order if the distances show none, as those of two runs; the least if absent
     """
@@ -101,11 +96,7 @@ def error_law(
     if order is None:
         order = orders[0] if assumed is None else assumed
     a, b = sizes[-2:]
-    distance = distances[-1]
-    if not observed and across is not None and a < SIMILAR_RATIO * b:
-        a = sizes[0]
-        distance = across
-    factor = _finer_error(distance, (a / b) ** order, cosine) / b**order
+    factor = _finer_error(distances[-1], (a / b) ** order, cosine) / b**order
     return ErrorLaw(factor, order, observed, cosine)
 
 

@@ -191,11 +191,10 @@ class Sizer:
         least, greatest = ORDERS
         orders = (USUAL_ORDER if is_out_of_phase else least, greatest)
         edges = [run.edge for run in runs]
-        known = None if is_out_of_phase else across
         if is_inverted:
-            law = error_law(edges, distances, (least, least), known, cosine)
+            law = error_law(edges, distances, (least, least), cosine)
         else:
-            law = error_law(edges, distances, orders, known, cosine, USUAL_ORDER)
+            law = error_law(edges, distances, orders, cosine, USUAL_ORDER)
         return replace(law, observed=law.observed and not is_inverted)
 
     def _coarser(self, power: float) -> int:

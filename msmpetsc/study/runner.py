@@ -11,6 +11,7 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
+import numpy as np
 from tqdm import tqdm
 
 from msmpetsc.errors import InputError
@@ -137,24 +138,6 @@ def _remove_files(path: Path, log: bool) -> None:
         path.with_suffix(suffix).unlink(missing_ok=True)
 
 
-@dataclass(frozen=True)
-class StudyPart:
-    """Part ``index`` of ``count`` parts of a study's cases, counted from 1."""
-
-    index: int
-    count: int
-
-    def of(self, cases: Sequence[str]) -> Sequence[str]:
-        """Return the consecutive cases of this part."""
-        return cases[
-            len(cases) * (self.index - 1) // self.count : len(cases) * self.index // self.count
-        ]
-
-    def folder(self, study: Path) -> Path:
-        """Return the folder of this part's table and results."""
-        return study / PARTS / f"{self.index}-of-{self.count}"
-
-
 def run_study(
     path: Path,
     folder: Path,
@@ -162,14 +145,14 @@ def run_study(
     full: bool = False,
     jobs: int | None = None,
     restart: bool = False,
-    part: StudyPart | None = None,
+    part: tuple[int, int] | None = None,
 ) -> list[Row]:
     """Run the cases of a study file that are not done, and return the rows of all cases.
 
     full    : include sweeps, scenes and maps that are marked ``full``
     jobs    : number of cases at a time; the study file's if None
     restart : discard the rows and references of earlier runs
-    part    : run and return only the cases of this part, in a folder of its own
+    part    : (i, n): run and return only part i of n, counted from 1, in a folder of its own
 
     ``folder`` gets table.csv, study.toml and references/. Rows of earlier runs and of parts are
     kept if their cases are still in the file. Raises InputError before the first run.
@@ -177,8 +160,10 @@ def run_study(
     require_extra()
     study = load_study(path)
     every, wanted = _cases(study, path, full)
-    wanted = part.of(wanted) if part else wanted
-    own = part.folder(folder) if part else folder
+    own = folder
+    if part:
+        wanted = np.array_split(wanted, part[1])[part[0] - 1].tolist()
+        own = part_folder(folder, part)
     own.mkdir(parents=True, exist_ok=True)
     if restart:
         (own / "table.csv").unlink(missing_ok=True)
@@ -208,7 +193,12 @@ def list_study(path: Path, folder: Path, full: bool = False) -> list[tuple[Case,
     return [(every[case], _is_done(every[case], rows)) for case in wanted]
 
 
-def _cases(study: Study, path: Path, full: bool) -> tuple[dict[str, Case], Sequence[str]]:
+def part_folder(study: Path, part: tuple[int, int]) -> Path:
+    """Return the folder of a part's table and results."""
+    return study / PARTS / "{}-of-{}".format(*part)
+
+
+def _cases(study: Study, path: Path, full: bool) -> tuple[dict[str, Case], list[str]]:
     """Return all cases by their id, and the ids of the cases to run."""
     every = {case.id: case for case in study_cases(study, path.parent, True)}
     return every, [case.id for case in study_cases(study, path.parent, full)]

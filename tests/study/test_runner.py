@@ -16,7 +16,7 @@ from study_files import ONE_SCENE, STAND_IN, alive, calls, carry_out, own_log, s
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
 from msmpetsc.study import table
-from msmpetsc.study.runner import StudyPart, list_study, run_study
+from msmpetsc.study.runner import list_study, run_study
 from msmpetsc.study.table import COLUMNS, read_table, records, write_table
 
 
@@ -62,19 +62,17 @@ def test_finished_cases_are_not_run_again(tmp_path: Path, stand_in):
 
 
 def test_parts_run_apart_and_are_joined(tmp_path: Path, stand_in):
-    """Three cases in parts of 1 and 2 cases. A part is run twice, its cases once."""
+    """Three cases in parts of 2 cases and 1. A part is run twice, its cases once."""
     text = ONE_SCENE + '[[sweep]]\npresets = ["newton"]\nerrors = [0.3, 0.2, 0.1]'
     path, out = study_file(tmp_path, text), tmp_path / "out"
-    found = {index: run_study(path, out, part=StudyPart(index, 2)) for index in (2, 1, 2)}
-    assert [[row["error"] for row in found[index]] for index in (1, 2)] == [[0.3], [0.2, 0.1]]
+    found = {index: run_study(path, out, part=(index, 2)) for index in (2, 1, 2)}
+    assert [[row["error"] for row in found[index]] for index in (1, 2)] == [[0.3, 0.2], [0.1]]
     assert (
         not (out / "table.csv").exists()
         and [done for _, done in list_study(path, out)] == [True] * 3
     )
-    assert [len(log.read_text().splitlines()) for log in sorted(out.glob("parts/*/calls.txt"))] == [
-        1,
-        2,
-    ]
+    logs = sorted(out.glob("parts/*/calls.txt"))
+    assert [len(log.read_text().splitlines()) for log in logs] == [2, 1]
     rows = carry_out(tmp_path, text)
     assert [row["error"] for row in rows] == [0.3, 0.2, 0.1] and calls(tmp_path) == []
     assert rows == [

@@ -6,7 +6,7 @@ from pathlib import Path
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, printable
 from msmpetsc.study.cases import shown_command
-from msmpetsc.study.runner import StudyPart, list_study, run_study
+from msmpetsc.study.runner import list_study, part_folder, run_study
 from msmpetsc.study.table import as_table, failed, swept
 
 
@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
         log.warning("%d case%s without figures: see the column reason", lost, "s" * (lost > 1))
     # the study that joins the parts writes the report
     if part:
-        print(part.folder(folder) / "table.csv")
+        print(part_folder(folder, part) / "table.csv")
         return 0
     # imported here, as loading the charts takes a second
     from msmpetsc.study.report import write_report
@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def part_of(text: str | None) -> StudyPart | None:
+def part_of(text: str | None) -> tuple[int, int] | None:
     """Return the part that "3/16" names, the third of 16; None for None. Raises InputError."""
     if text is None:
         return None
@@ -49,4 +49,4 @@ def part_of(text: str | None) -> StudyPart | None:
     numbers = all(part.isdecimal() and len(part) < 10 for part in (index, count))
     if not (numbers and 1 <= int(index) <= int(count)):
         raise InputError(f"--part must read I/N, 1 <= I <= N, not {printable(text, 40)}")
-    return StudyPart(int(index), int(count))
+    return int(index), int(count)

@@ -138,11 +138,6 @@ def spread(values: Sequence[float]) -> str:
 # ---- output
 
 
-def slope(sizes: Sequence[float] | np.ndarray, errors: Sequence[float] | np.ndarray) -> float:
-    """Return the slope of the line fitted to log |error| over log size."""
-    return np.polyfit(np.log(sizes), np.log(np.abs(errors)), 1)[0]
-
-
 def shown(value: object) -> str:
     """Return a value as a table's cell: three digits of a float, "" for None."""
     if value is None:
@@ -170,22 +165,6 @@ def table(rows: Iterable[Row]) -> None:
 def parser(documentation: str | None) -> ArgumentParser:
     """Return a parser that prints a script's docstring for --help."""
     return ArgumentParser(description=documentation, formatter_class=RawDescriptionHelpFormatter)
-
-
-def tables(documentation: str | None, tables: Mapping[str, Callable[[], Rows]]) -> None:
-    """Print the tables of a study that the command line names, or all of them."""
-    options = parser(documentation)
-    options.add_argument(
-        "tables", nargs="*", metavar="TABLE", help=f"{', '.join(tables)}; all by default"
-    )
-    args = options.parse_args()
-    if unknown := set(args.tables) - set(tables):
-        known = ", ".join(tables)
-        options.error(f"no table {', '.join(sorted(unknown))}; the tables are {known}")
-    heading()
-    for name in args.tables or tables:
-        print(f"\n## {name}")
-        table(tables[name]())
 
 
 def heading() -> None:

@@ -1,8 +1,7 @@
 #!/usr/bin/env python3
 """Check the English of docstrings and comments:  scripts/prose.py [options] [files or folders]
 
-Print each offence with its place, then the rates of each folder. With --quiet print faults alone,
-with --comments check the place and width of comments alone.
+Print each offence with its place, then the rates of each folder. With --quiet print faults alone.
 Exit with status 1 if a sentence is too long or begins badly, or if a comment stands behind code or
 is too wide. The same holds if a folder has too many of the vague words.
 """
@@ -68,21 +67,16 @@ def sentences(text: str) -> Iterator[str]:
         yield from re.split(r"(?<=[.!?:;])\s+", " ".join(paragraph.split()))
 
 
-def misplaced(source: str) -> Iterator[tuple[int, str]]:
-    """Yield line number and fault of comments that stand behind code or are too wide."""
-    for line, _, behind, width in comments(source):
-        if behind:
-            yield line, "comment behind code: give it a line of its own above"
-        elif width > WIDEST:
-            yield line, f"comment of {width} columns, at most {WIDEST}"
-
-
 def offences(path: Path, counts: Counter[str]) -> Iterator[tuple[int, str]]:
     """Yield line number and fault; add the words of the file to ``counts``."""
     source = path.read_text()
     texts = [(line, text) for line, text in docstrings(source)]
     texts += [(line, text) for line, text, _, _ in comments(source)]
-    yield from misplaced(source)
+    for line, _, behind, width in comments(source):
+        if behind:
+            yield line, "comment behind code: give it a line of its own above"
+        elif width > WIDEST:
+            yield line, f"comment of {width} columns, at most {WIDEST}"
     for line, text in texts:
         words = Counter(re.findall(r"[a-z']+", CODE.sub("", text).lower()))
         counts["words"] += words.total()
@@ -103,18 +97,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition(":")[0])
     parser.add_argument("paths", nargs="*", type=Path, default=[ROOT / "msmpetsc"])
     parser.add_argument("--quiet", action="store_true", help="print faults alone, no counts")
-    parser.add_argument(
-        "--comments", action="store_true", help="check place and width of comments alone"
-    )
     options = parser.parse_args()
     files = [sorted(path.rglob("*.py")) or [path] for path in options.paths]
     failed, folders = False, defaultdict[Path, Counter[str]](Counter)
-    if options.comments:
-        for file in itertools.chain.from_iterable(files):
-            for line, fault in misplaced(file.read_text()):
-                print(f"{file}:{line}: {fault}")
-                failed = True
-        return int(failed)
     for file in itertools.chain.from_iterable(files):
         for line, fault in sorted(offences(file, folders[file.parent])):
             is_count = fault.startswith("(")

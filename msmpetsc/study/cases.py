@@ -278,27 +278,24 @@ def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
         base = base.changed(f"material.law={reference.law}")
     frame = as_given.time.step
     duration = scene.seconds(frame, as_given.time.duration)
-    case = replace(
-        base,
-        integrator=reference.integrator,
-        time_step=frame,
-        repeats=1,
-        timeout=reference.timeout,
-        label="reference",
-    )
-    surface = reference.cells is not None
     if reference.integrator == "verlet":
-        return with_tables(replace(case, substep=reference.substep), duration, 1, as_given, surface)
-    # the schema has refused an implicit reference without a step
-    step = reference.step or frame
+        step = frame
+        own: dict[str, Any] = {"substep": reference.substep}
+    else:
+        # the schema has refused an implicit reference without a step
+        step = reference.step or frame
+        own = {"preset": reference.preset, "error": reference.error}
     every = round(frame / step)
     if every < 1 or not math.isclose(every * step, frame, rel_tol=1e-6):
         raise InputError(
             f"scene {base.scene}: time.step = {frame:g} s "
             f"is no multiple of reference.step = {step:g} s"
         )
-    case = replace(case, time_step=step, preset=reference.preset, error=reference.error)
-    return with_tables(case, duration, every, as_given, surface)
+    case = replace(
+        base, integrator=reference.integrator, time_step=step, repeats=1, label="reference",
+        timeout=reference.timeout, **own,
+    )  # fmt: skip
+    return with_tables(case, duration, every, as_given, reference.cells is not None)
 
 
 def map_cases(study: Study, map: Map, folder: Path) -> Iterator[Case]:

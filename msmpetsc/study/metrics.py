@@ -37,16 +37,14 @@ def costs(record: dict[str, Any]) -> Row:
     row = {name: record.get(name) for name in names}
     for part in ("setup", "factor", "local", "ksp", "output"):
         row[f"time_{part}"] = record.get("time", {}).get(part)
-    machine = record.get("machine", {})
-    parts = [machine.get("cpu"), machine.get("cores") and f"{machine['cores']} cores"]
-    parts += [
-        machine.get("memory") and f"{machine['memory'] / 2**30:.0f} GiB",
-        machine.get("system"),
-    ]
+    machine = ""
+    if host := record.get("machine"):
+        memory = f"{host['memory'] / 2**30:.0f} GiB"
+        machine = f"{host['cpu']}, {host['cores']} cores, {memory}, {host['system']}"
     versions = ", ".join(
         f"{name} {version}" for name, version in record.get("versions", {}).items()
     )
-    return row | {"machine": ", ".join(str(part) for part in parts if part), "versions": versions}
+    return row | {"machine": machine, "versions": versions}
 
 
 def frame_metrics(result: Path, time_step: float) -> Row:

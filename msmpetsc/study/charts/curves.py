@@ -152,9 +152,6 @@ def size_charts(table: DataFrame, styles: Styles) -> list[Chart]:
     labels = dict.fromkeys(concat(scenes.values())["label"])
     own = {label: styles[label] for label in labels}
     chart = Chart("size", SIZES, SIZES, SIZES_CAPTION, own, columns=2, height=200)
-    if len(scenes) == 1:
-        chart.name += f"_{next(iter(scenes))}"
-        chart.title += f": {next(iter(scenes))}"
     for scene, rows in scenes.items():
         draw_sizes(chart, scene, rows.sort_values("cells", kind="stable"))
     return [chart]

@@ -87,28 +87,27 @@ def tips(rows: DataFrame, names: Iterable[str]) -> list[str]:
     return ["\n".join(filter(None, tip)) for tip in lines]
 
 
-def channel(title: str, words: str, ticks: Iterable[float], **scale: Any) -> dict[str, Any]:
+def channel(title: str, words: str, **scale: Any) -> dict[str, Any]:
     """Return an axis whose tick labels the Vega expression ``words`` formats."""
-    axis = {"values": list(ticks), "labelExpr": words}
     return {
         "type": "quantitative",
         "title": title,
         "scale": {"nice": False, "zero": False} | scale,
-        "axis": axis,
+        "axis": {"labelExpr": words},
     }
 
 
 def log_axis(title: str, values: ArrayLike, words: str) -> dict[str, Any]:
-    """Return a logarithmic axis for positive values, at least a decade long; NaN is ignored."""
-    low, high = math.log10(np.nanmin(values)), math.log10(np.nanmax(values))
-    middle = (low + high) / 2
-    half = max(high - low, 0.85) * 0.58
-    low, high = middle - half, middle + half
-    steps = (1, 2, 5) if high - low < 2.5 else (1,)
-    ticks = [
-        step * 10.0**decade for decade in range(math.floor(low), math.ceil(high)) for step in steps
-    ]
-    return channel(title, words, ticks, type="log", domain=[10**low, 10**high])
+    """Return a logarithmic axis for positive values, with a factor of 2 beside them.
+
+    NaN is ignored.
+    """
+    low, high = float(np.nanmin(values)) / 2, float(np.nanmax(values)) * 2
+    made = channel(title, words, type="log", domain=[low, high])
+    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)))
+    steps = (1, 2, 5) if len(decades) < 4 else (1,)
+    made["axis"]["values"] = [step * 10.0**decade for decade in decades for step in steps]
+    return made
 
 
 @dataclass

@@ -93,9 +93,8 @@ def draw_profile(chart: Chart, title: str, factors: DataFrame) -> None:
     """Draw the share of problems over the factor as a step function for each method."""
     known = factors.to_numpy(float)
     right = min(max(1.1 * float(known[np.isfinite(known)].max()), 2.0), FARTHEST)
-    ticks = [tick for tick in (1, 2, 5, 10, 20, 50, 100) if tick <= right]
-    x = channel("factor", "format(datum.value, '~g')", ticks, type="log", domain=[1, right])
-    y = channel("problems", "format(datum.value, '.0%')", np.arange(5) / 4, domain=[0, 1])
+    x = channel("factor", "format(datum.value, '~g')", type="log", domain=[1, right])
+    y = channel("problems", "format(datum.value, '.0%')", domain=[0, 1])
     panel = chart.panel(f"by {title}", x, y)
     values = []
     for label, column in zip(factors, known.T, strict=True):

@@ -20,7 +20,7 @@ from msmpetsc.results.disk import write_whole
 from msmpetsc.study import formatting
 from msmpetsc.study.table import records, spread
 
-INK, FAINT, GRID = "#2b2f36", "#8a8f98", "#e4e6ea"
+INK, FAINT = "#2b2f36", "#8a8f98"
 # Okabe and Ito's colours without yellow, faint on white; then Paul Tol's and a brown
 COLORS = (
     "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#333333", "#e69f00", "#56b4e9",
@@ -40,15 +40,11 @@ CONFIG: dict[str, Any] = {
     "background": "white",
     "font": "DejaVu Sans, Verdana, Arial, sans-serif",
     "view": {"stroke": None},
-    "axis": {
-        "labelColor": INK, "titleColor": INK, "titleFontWeight": "normal", "gridColor": GRID,
-        "domainColor": FAINT, "tickColor": FAINT, "labelFontSize": 12, "titleFontSize": 12,
-        "labelOverlap": "greedy",
-    },
-    "title": {"anchor": "start", "color": INK, "fontWeight": "normal", "fontSize": 13},
+    "axis": {"titleFontWeight": "normal", "labelFontSize": 12, "labelOverlap": "greedy"},
+    "title": {"anchor": "start", "fontWeight": "normal"},
     "legend": {
-        "orient": "bottom", "labelFontSize": 12, "labelColor": INK, "symbolSize": 90,
-        "columnPadding": 24, "labelLimit": WIDTH, "symbolOpacity": 1, "symbolStrokeWidth": 0,
+        "orient": "bottom", "labelFontSize": 12, "labelLimit": WIDTH, "symbolOpacity": 1,
+        "symbolStrokeWidth": 0,
     },
     "point": {"opacity": 1},
 }  # fmt: skip

@@ -23,11 +23,10 @@ from msmpetsc.study.table import (
     NUMBERS,
     TEXT,
     failed,
-    is_repeated,
     mapped,
     read_table,
+    succeeded,
     swept,
-    timed,
 )
 
 # leading columns of the table of all cases
@@ -91,12 +90,10 @@ def facts(table: DataFrame) -> dict[str, Any]:
         for name in ("machine", "versions")
     }
     counts = {"cases": len(plain), "failed": len(failed(plain)), "empty": table.empty}
-    rows = timed(plain)
+    repeats = sorted(set(succeeded(plain)["repeats"].fillna(1).astype(int)))
     # empty if no case succeeded
-    often = " or ".join(map(str, sorted(set(rows["repeats"].fillna(1).astype(int)))))
-    note = often and f"{often}: how much times vary is not known; repeats = 3 would tell"
-    if not rows.empty and is_repeated(rows):
-        note = f"{often}: times are medians, ranges and whiskers from the least to the greatest"
+    often = " or ".join(map(str, repeats))
+    note = often and f"{often}: times are medians, whiskers from the least to the greatest"
     return counts | {"maps": maps, "platforms": platforms, "repeats": note}
 
 

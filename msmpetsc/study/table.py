@@ -119,11 +119,6 @@ def measured(table: "DataFrame", *columns: str) -> "DataFrame":
     return table[(table[list(columns)] > 0).all(axis=1)]
 
 
-def timed(table: "DataFrame") -> "DataFrame":
-    """Return the rows of cases that succeeded and have a time per step."""
-    return measured(succeeded(table), "time_frame")
-
-
 def grouped(table: "DataFrame", *columns: str) -> dict[Any, "DataFrame"]:
     """Return the rows grouped by the values of columns, in order of first appearance."""
     by: Any = columns[0] if len(columns) == 1 else list(columns)
@@ -147,8 +142,3 @@ def spread(table: "DataFrame", cost: str) -> "DataFrame":
     return table.assign(least=least.where(known), greatest=greatest.where(known))[
         ["least", "greatest"]
     ]
-
-
-def is_repeated(table: "DataFrame") -> bool:
-    """Return whether every case was run more than once."""
-    return bool(table["time_frame_min"].notna().all())

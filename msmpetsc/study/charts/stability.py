@@ -138,6 +138,4 @@ def symbol(row: Row) -> str:
     count = row["iterations"]
     if row["outcome"] in SYMBOLS or count is None:
         return SYMBOLS.get(row["outcome"], "")
-    if count < 1000:
-        return f"{count:.0f}"
-    return f"{count / 1000:.{int(count < 9950)}f}k"
+    return f"{count:.0f}" if count < 1000 else formatting.prefixed(count)

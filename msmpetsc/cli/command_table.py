@@ -155,7 +155,7 @@ COMMANDS = {
                 "--mesh", type=checked_file, metavar="MESH",
                 help="mesh file in or below the scene's folder, or a model of `fetch --list`",
             ),
-            argument("--up", choices=("y", "z"), help="mesh's upward axis; z by default, y for glTF"),
+            argument("--up", choices=("y", "z"), help="mesh's upward axis (z; y for glTF)"),
             argument("--from", dest="from_scene", metavar="NAME", help="scene to copy, see --list"),
             switch("--list", "list the scenes that come with msmpetsc"),
             switch("--overwrite", "replace SCENE.toml if it exists"),

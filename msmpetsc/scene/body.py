@@ -5,7 +5,6 @@ from typing import Annotated, Any, Final, Literal, Self, get_args
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator, model_validator
 
 from msmpetsc.scene.problems import rule
-from msmpetsc.scene.suggestions import unknown_name
 from msmpetsc.scene.values import (
     Box,
     Count,
@@ -57,7 +56,7 @@ def _step(value: Any) -> str | dict[str, Any]:
     if value in StepTable.one_of:
         raise rule(f"needs a value: {{ {value} = ... }}")
     if value not in get_args(StepName):
-        raise unknown_name(get_args(StepName))
+        raise rule(f"must be one of {', '.join(get_args(StepName))}")
     return value
 
 
@@ -152,8 +151,7 @@ class Material(Table):
         if self.law == SOLID and self.stiffness is not None:
             raise rule(
                 'has stiffness, which is for springs: give law = "linear", or give young_modulus '
-                "in place of stiffness",
-                "stiffness",
+                "in place of stiffness"
             )
         return self
 
@@ -220,7 +218,7 @@ class Region(Table):
     def _has_a_use(cls, relative: bool, info: ValidationInfo) -> bool:
         for key, selection in (("painted", "painted points"), ("group", "a group")):
             if relative and info.data.get(key) is not None:
-                raise rule(f"has no meaning for {selection}", key)
+                raise rule(f"has no meaning for {selection}")
         return relative
 
     @property

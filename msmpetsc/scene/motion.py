@@ -6,8 +6,7 @@ from typing import Annotated, Self
 from pydantic import AfterValidator, Discriminator, Field, Tag, field_validator, model_validator
 
 from msmpetsc.scene.body import Region
-from msmpetsc.scene.problems import rule
-from msmpetsc.scene.suggestions import TAGS
+from msmpetsc.scene.problems import TAGS, rule
 from msmpetsc.scene.values import (
     Components,
     Direction,

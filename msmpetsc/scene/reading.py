@@ -160,15 +160,14 @@ def _checked(
         text = tomli_w.dumps(data) if keys or not text else text
         return Scene(**given, text=text, folder=path.parent), keys
     except ValidationError as error:
-        raise InputError("\n".join(problem_lines(path, error, text, keys))) from None
+        raise InputError("\n".join(problem_lines(path, error))) from None
     except TypeError as error:
         raise InputError(f"{path}: cannot be written as TOML: {error}") from None
 
 
-def read_toml(path: Path, kind: str = "scene") -> tuple[str, dict[str, Any]]:
-    """Return text and data of a TOML file. Raises InputError that calls it a ``kind`` file."""
-    text = _read(path, kind)
-    return text, _parse(path, text)
+def read_toml(path: Path, kind: str = "scene") -> dict[str, Any]:
+    """Return the data of a TOML file. Raises InputError that calls it a ``kind`` file."""
+    return _parse(path, _read(path, kind))
 
 
 def _refuse_outside(path: Path, scene: SceneFile, given: Collection[KeyPath] | None) -> None:

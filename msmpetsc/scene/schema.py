@@ -92,10 +92,10 @@ def unlike_the_material(scene: Any) -> Iterator[Broken]:
         for name in Material.one_of:
             if getattr(material, name) is not None and getattr(scene.material, name) is None:
                 words = f"may give {name} only where material does, as {key} does"
-                yield table, rule(words, "material")
+                yield table, rule(words)
         if material.poisson_ratio is not None and scene.material.poisson is None:
             words = f'may give poisson_ratio only with material.law = "neo-hookean", as {key} does'
-            yield table, rule(words, "material")
+            yield table, rule(words)
     for name in (*Material.one_of, "density"):
         values = {
             key: value
@@ -122,7 +122,7 @@ def regions_of_no_body(scene: Any) -> Iterator[Broken]:
                     f"may have no {sort} region beside [[body]], as {kind}.{number} has: move it "
                     f"into [[body.{kind}]], which names the body"
                 )
-                yield kind, rule(words, "body")
+                yield kind, rule(words)
 
 
 # relative error of a step if neither scene nor preset gives another [-]
@@ -247,7 +247,7 @@ class SceneFile(Table):
                 f'may not have stress = true with material.law = "{self.material.law}": '
                 "springs have no stress"
             )
-            yield "output", rule(words, "material")
+            yield "output", rule(words)
         yield from chain(
             unlike_the_material(self), regions_of_no_body(self), unlike_the_integrator(self)
         )

@@ -58,9 +58,9 @@ class Time(Table):
     def _holds_a_step(cls, duration: float, info: ValidationInfo) -> float:
         step = info.data.get("step", duration)
         if duration / step > MAX_STEPS:
-            raise rule(f"holds too many steps of {step:g} s", "step")
+            raise rule(f"holds too many steps of {step:g} s")
         if round(duration / step) < 1:
-            raise rule(f"must hold at least one step of {step:g} s", "step")
+            raise rule(f"must hold at least one step of {step:g} s")
         return duration
 
     @property
@@ -106,13 +106,13 @@ def unlike_the_integrator(scene: Any) -> Iterator[Broken]:
             f'may not have integrator = "{integrator}" with material.retardation_time: use '
             '"implicit-euler" or "bdf2"'
         )
-        yield "time", rule(words, "material")
+        yield "time", rule(words)
     if integrator == STATIC:
         yield from _broken_by_statics(scene)
     if scene.touching and integrator not in IMPLICIT:
         words = f'is for time.integrator = "implicit-euler" or "bdf2" only, not "{integrator}"'
         barrier = "" if scene.self_contact else 'with response = "barrier" '
-        yield "self_contact" if scene.self_contact else "obstacle", rule(barrier + words, "time")
+        yield "self_contact" if scene.self_contact else "obstacle", rule(barrier + words)
     for number, obstacle in enumerate(scene.obstacle):
         if obstacle.response != "exchange":
             continue
@@ -123,20 +123,20 @@ def unlike_the_integrator(scene: Any) -> Iterator[Broken]:
                 f"obstacle.{number} has: it moves nodes back by one step; use "
                 'response = "reflect" or "penalty"'
             )
-            yield "obstacle", rule(words, "time")
+            yield "obstacle", rule(words)
         if scene.touching:
             words = (
                 f'may not have response = "exchange" with surface contact, as obstacle.{number} '
                 'has: it moves nodes past each other; use response = "reflect" or "penalty"'
             )
-            yield "obstacle", rule(words, "self_contact")
+            yield "obstacle", rule(words)
 
 
 def _broken_by_statics(scene: Any) -> Iterator[Broken]:
     """Yield the broken rules of a static scene: damping, velocities, force functions, impacts."""
     if scene.material.damping:
         words = f'may not have integrator = "{STATIC}" with material.damping: nothing moves'
-        yield "time", rule(words, "material")
+        yield "time", rule(words)
     bodies = [("body", f"body.{number}.", body) for number, body in enumerate(scene.body)]
     for key, prefix, tables in [("", "", scene), *bodies]:
         if tables.start is not None and tables.start.moves:
@@ -144,7 +144,7 @@ def _broken_by_statics(scene: Any) -> Iterator[Broken]:
                 f"{key and f'{prefix}start '}may have no velocity, spin, gradient or swirl with "
                 f'time.integrator = "{STATIC}": there is no inertia'
             )
-            yield key or "start", rule(words, "time")
+            yield key or "start", rule(words)
         for number, force in enumerate(tables.force):
             if force.function is not None:
                 words = (
@@ -152,18 +152,18 @@ def _broken_by_statics(scene: Any) -> Iterator[Broken]:
                     f"{prefix}force.{number} is: it is evaluated at the previous state, so the "
                     "static state would not balance it"
                 )
-                yield key or "force", rule(words, "time")
+                yield key or "force", rule(words)
     for number, obstacle in enumerate(scene.obstacle):
         if obstacle.response not in ("penalty", "barrier"):
             words = (
                 f'may not {obstacle.response} with time.integrator = "{STATIC}", as '
                 f'obstacle.{number} does: nothing strikes it; use response = "penalty"'
             )
-            yield "obstacle", rule(words, "time")
+            yield "obstacle", rule(words)
         if obstacle.friction:
             words = (
                 f'may have no friction with time.integrator = "{STATIC}", as obstacle.{number} '
                 "has: friction depends on the motion; use an implicit integrator with "
                 "material.damping"
             )
-            yield "obstacle", rule(words, "time")
+            yield "obstacle", rule(words)

@@ -2,9 +2,9 @@
 
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise
-from typing import Annotated, Any, ClassVar, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -19,8 +19,7 @@ from pydantic import (
 )
 from pydantic_core import InitErrorDetails
 
-from msmpetsc.scene.problems import Broken, one_of_problems, rule
-from msmpetsc.scene.suggestions import restated, unknown_name
+from msmpetsc.scene.problems import Broken, rule, unknown_key
 
 
 def _nonzero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -85,7 +84,7 @@ def after_start(cls: Any, stop: float | None, info: ValidationInfo) -> float | N
     """Return ``stop`` as a pydantic validator; raise a broken rule unless stop > start."""
     start = info.data.get("start")
     if stop is not None and start is not None and stop <= start:
-        raise rule(f"must be > start = {start:g}", "start")
+        raise rule(f"must be > start = {start:g}")
     return stop
 
 
@@ -107,7 +106,7 @@ def only_for(key: str, *values: str) -> Callable[..., Any]:
 
     def check(cls: Any, given: Any, info: ValidationInfo) -> Any:
         if info.data.get(key, values[0]) not in values:
-            raise rule(f"is for {key} = {' or '.join(map(json.dumps, values))} only", key)
+            raise rule(f"is for {key} = {' or '.join(map(json.dumps, values))} only")
         return given
 
     return check
@@ -116,7 +115,7 @@ def only_for(key: str, *values: str) -> Callable[..., Any]:
 def _known_preset(name: str, info: ValidationInfo) -> str:
     presets = (info.context or {}).get("presets")
     if presets is not None and name not in presets:
-        raise unknown_name(presets)
+        raise rule(f"must be one of {', '.join(presets)}")
     return name
 
 
@@ -160,20 +159,28 @@ class Table(BaseModel):
         """Yield the broken rules between keys that are valid by themselves."""
         return iter(())
 
-    @model_validator(mode="wrap")
+    @model_validator(mode="before")
     @classmethod
-    def _all_problems(cls, data: Any, handler: Callable[[Any], Any]) -> Any:
-        """Return the checked table; raise all problems, pydantic's and our own, together."""
+    def _has_known_keys(cls, data: Any) -> Any:
         known = [field.alias or name for name, field in cls.model_fields.items()]
-        problems = one_of_problems(data, cls.one_of, known)
-        try:
-            table = handler(data)
-            problems += [
-                InitErrorDetails(type=broken, loc=(key,), input=data.get(key))
-                for key, broken in table.broken_rules()
-            ]
-        except ValidationError as error:
-            problems += restated(error, known)
-        if problems:
-            raise ValidationError.from_exception_data(cls.__name__, problems)
-        return table
+        if isinstance(data, dict):
+            _raise_all(data, [(key, unknown_key(key, known)) for key in data if key not in known])
+        return data
+
+    @model_validator(mode="after")
+    def _keeps_rules(self) -> Self:
+        given = [name for name in self.one_of if name in self.model_fields_set]
+        if self.one_of and len(given) != 1:
+            has = " and ".join(given) or "none"
+            raise rule(f"must give exactly one of {', '.join(self.one_of)}; has {has}")
+        _raise_all(vars(self), self.broken_rules())
+        return self
+
+
+def _raise_all(data: Mapping[str, Any], broken: Iterable[Broken]) -> None:
+    """Raise the problems of keys of a table together, if there are any."""
+    problems = [
+        InitErrorDetails(type=problem, loc=(key,), input=data[key]) for key, problem in broken
+    ]
+    if problems:
+        raise ValidationError.from_exception_data("table", problems)

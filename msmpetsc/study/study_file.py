@@ -102,7 +102,7 @@ class Length(Table):
     @classmethod
     def _single_length(cls, duration: float | None, info: ValidationInfo) -> float | None:
         if duration is not None and info.data.get("steps") is not None:
-            raise rule("must not stand beside steps", "steps")
+            raise rule("must not stand beside steps")
         return duration
 
     def seconds(self, step: float, usual: float) -> float:
@@ -273,10 +273,10 @@ class Study(Table):
 
 def load_study(path: Path) -> Study:
     """Return the checked contents of a study file. Raises InputError that names every problem."""
-    text, data = read_toml(path, "study")
+    data = read_toml(path, "study")
     if {"mesh", "body"} & data.keys() and OF_STUDIES.isdisjoint(data):
         raise InputError(f"{path}: is a scene, no study: msmpetsc run {shlex.quote(str(path))}")
     try:
         return Study.model_validate(data, context={"presets": preset_names()})
     except ValidationError as error:
-        raise InputError("\n".join(problem_lines(path, error, text, {}))) from None
+        raise InputError("\n".join(problem_lines(path, error))) from None

@@ -52,10 +52,10 @@ def test_its_times_are_events_for_adaptive_steps_and_statics(tmp_path: Path):
 WRONG = {
     "must have ascending times": {"times": [0, 0], "values": [[0, 0, 0], [0, 0, 1]]},
     "2 times and 1 values": {"times": [0, 1], "values": [[0, 0, 0]]},
-    "force.0.total.values.0: must have 3 items": {"times": [0], "values": [[0, 0]]},
-    "force.0.total.times.0: must be >= 0": {"times": [-1], "values": [[0, 0, 1]]},
+    "force.0.total.values.0.2: required": {"times": [0], "values": [[0, 0]]},
+    "force.0.total.times.0: must be greater than or": {"times": [-1], "values": [[0, 0, 1]]},
     "force.0.total.time: unknown key, did you mean 'times'?": {"time": [0], "values": [[0, 0, 1]]},
-    "force.0.total: must have 3 items": [1, 2],
+    "force.0.total.2: required": [1, 2],
     "force.0.total: must be a list": "down",
 }
 

@@ -194,7 +194,7 @@ ONCE = "pin.0.fix: must name one to three components, each once, got"
     ("pin", "time", "message"),
     [
         ({"fix": ["x", "x"]}, {}, ONCE),
-        ({"fix": ["w"]}, {}, 'pin.0.fix.0: unknown value "w"'),
+        ({"fix": ["w"]}, {}, "pin.0.fix.0: must be 'x', 'y' or 'z'"),
         ({"fix": []}, {}, ONCE),
         ({"fix": ["x", "z"]}, {"integrator": "static"}, "the body is held by nothing along y"),
     ],

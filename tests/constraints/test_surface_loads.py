@@ -156,7 +156,7 @@ def test_a_half_takes_the_pressure_of_the_whole(tmp_path: Path):
             {"region": {"painted": [0]}, "value": 1.0},
             "pressure.0.region: must be a box, sphere, half_space or group",
         ),
-        ("pressure", {"region": ALL, "value": "1"}, "pressure.0.value: must be a number"),
+        ("pressure", {"region": ALL, "value": "1"}, "pressure.0.value: must be a valid number"),
     ],
 )
 def test_bad_input_is_one_line(tmp_path: Path, kind: str, table: dict, message: str):

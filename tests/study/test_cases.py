@@ -17,9 +17,9 @@ from msmpetsc.study.study_file import load_study
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        (ONE_SCENE + "[[sweep]]\nprests = []", ["sweep.0.prests", "'presets'", "(line 5)"]),
-        (ONE_SCENE + '[[sweep]]\npresets = ["newtom"]', ["sweep.0.presets.0", "'newton'"]),
-        (ONE_SCENE + "[[sweep]]\nerrors = [2.0]", ["sweep.0.errors.0", "must be < 1"]),
+        (ONE_SCENE + "[[sweep]]\nprests = []", ["sweep.0.prests", "'presets'"]),
+        (ONE_SCENE + '[[sweep]]\npresets = ["newtom"]', ["sweep.0.presets.0", "newton"]),
+        (ONE_SCENE + "[[sweep]]\nerrors = [2.0]", ["sweep.0.errors.0", "must be less than 1"]),
         (
             ONE_SCENE + '[[sweep]]\noptions = ["-pc_type \'icc"]',
             ["sweep.0.options.0", "no closing quotation"],

@@ -100,7 +100,7 @@ def tables(method: PlannedMethod) -> dict[str, dict[str, Any]]:
 
 def overrides(scene: Path, tables: Tables) -> list[str]:
     """Return changes of a scene file as arguments of --set. Raises InputError."""
-    _, document = read_toml(scene)
+    document = read_toml(scene)
     # --set cannot remove a key, so whole tables are replaced
     return [
         f"{name}={toml_value({**document.get(name, {}), **table})}"

@@ -61,7 +61,7 @@ class RunRequest:
         "scene file (TOML); in Python also a Scene or its tables",
         nargs="?",
         metavar="SCENE",
-        type=checked_path,
+        type=checked_file,
     )
     output: File | None = given(
         None,

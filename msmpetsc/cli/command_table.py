@@ -87,7 +87,7 @@ def whole(name: str, value: str, about: str, **keywords: Any) -> Argument:
     return argument(name, type=at_least_1, metavar=value, help=about, **keywords)
 
 
-SCENE = argument("scene", type=checked_path, metavar="SCENE", help="scene file (TOML)")
+SCENE = argument("scene", type=checked_file, metavar="SCENE", help="scene file (TOML)")
 SET = argument(
     "--set",
     action="append",
@@ -218,7 +218,7 @@ COMMANDS = {
             "msmpetsc study my_study.toml -o out/my_study --jobs 2",
         ),
         (
-            argument("study", type=checked_path, metavar="FILE.toml", help="study file"),
+            argument("study", type=checked_file, metavar="FILE.toml", help="study file"),
             argument(
                 "-o", "--output", type=checked_path, metavar="FOLDER",
                 help="folder of the results; default: out/FILE",

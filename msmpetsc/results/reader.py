@@ -4,6 +4,7 @@ The file is checked when it is opened (results.untrusted_file). Then all arrays 
 `msmpetsc.fields` says.
 """
 
+import tomllib
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
@@ -21,7 +22,6 @@ from msmpetsc.results.untrusted_file import (
     open_result,
     plain_damage,
 )
-from msmpetsc.scene.toml import toml_of
 
 # frames can be read without scipy
 if TYPE_CHECKING:
@@ -243,7 +243,7 @@ class Result:
         if not isinstance(text, str):
             raise InputError(f"{self.path} does not say its scene")
         try:
-            return toml_of(text)
+            return tomllib.loads(text)
         except (ValueError, RecursionError) as error:
             raise InputError(f"{self.path}: its scene is not TOML: {one_line(error)}") from error
 

@@ -1,31 +1,9 @@
-"""Conversion between TOML text and data, with a limit on nesting.
-
-This module imports no package beyond Python's own, so that reading a result can use it.
-"""
+"""Conversion of data to TOML text; imports no package beyond Python's own."""
 
 import json
-import re
-import tomllib
 from collections.abc import Iterable, Mapping
 from os import PathLike, fspath
 from typing import Any
-
-# largest number of parts in a dotted key [-]; tomllib's time is quadratic in it
-DEEPEST = 50
-KEY = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
-DEEP_KEY = re.compile(
-    rf"(?:^|[\[{{,])[ \t]*{KEY}(?:[ \t]*\.[ \t]*{KEY}){{{DEEPEST}}}", re.MULTILINE
-)
-
-
-def toml_of(text: str) -> dict[str, Any]:
-    """Return the data of a TOML text.
-
-    Raises ValueError for text that is not TOML, RecursionError for data nested too deeply.
-    """
-    if DEEP_KEY.search(text):
-        raise RecursionError
-    return tomllib.loads(text)
 
 
 def plain(value: Any) -> Any:

@@ -1,11 +1,12 @@
 """A surface to draw whose nodes are its points, for tests of drawing alone."""
 
+import tomllib
+
 import numpy as np
 from ball_result import BARE
 from scipy.sparse import csr_array, eye_array
 
 from msmpetsc.scene.schema import SceneFile
-from msmpetsc.scene.toml import toml_of
 from msmpetsc.view.drawable import BodiesAtRest, Drawable
 
 
@@ -15,7 +16,7 @@ def drawable_of(points: np.ndarray, triangles: np.ndarray) -> Drawable:
     body = np.zeros(len(points), int)
     return Drawable(
         name="x.h5",
-        scene=SceneFile.model_validate(toml_of(BARE)),
+        scene=SceneFile.model_validate(tomllib.loads(BARE)),
         rest=BodiesAtRest(points, np.array([[*ends, 0, 0]]), points, body, body),
         pinned=np.zeros(len(points), bool),
         triangles=triangles,

@@ -1,5 +1,6 @@
 """Fields on a surface: each on a motion of which it is known."""
 
+import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,6 @@ from surface_alone import drawable_of
 from msmpetsc.errors import InputError
 from msmpetsc.results.reader import Result
 from msmpetsc.scene.schema import SceneFile
-from msmpetsc.scene.toml import toml_of
 from msmpetsc.view.colours import COLOURINGS, SCALE, Colouring, colouring_of, scaled
 from msmpetsc.view.drawable import BodiesAtRest, Drawable, drawable_of_result
 
@@ -53,7 +53,7 @@ def test_stress_is_von_mises_at_the_nodes_in_a_unit_of_its_size(subject):
     text = BARE.replace(
         'stiffness = 1.0, law = "linear"', 'young_modulus = 1.0, law = "neo-hookean"'
     )
-    solid = SceneFile.model_validate(toml_of(text))
+    solid = SceneFile.model_validate(tomllib.loads(text))
     with pytest.raises(InputError, match=r"output\.stress = true"):
         colouring_of(replace(subject, scene=solid), "stress")
 
@@ -85,7 +85,9 @@ def test_parts_are_those_of_the_nearest_cell(subject):
     rest = BodiesAtRest(nodes, cells, points, np.zeros(len(nodes), int), np.zeros(2, int))
     east = "region = { half_space = { point = [1, 0, 0], normal = [1, 0, 0] } }\n"
     tables = f"[[part]]\n{east}density = 2.0\n[[part]]\n{east}density = 3.0\n"
-    parted = replace(subject, rest=rest, scene=SceneFile.model_validate(toml_of(BARE + tables)))
+    parted = replace(
+        subject, rest=rest, scene=SceneFile.model_validate(tomllib.loads(BARE + tables))
+    )
     part = colouring_of(parted, "part")
     assert part.values(0).tolist() == [0, 2] and part.classes == ("material", "part.0", "part.1")
 
@@ -145,7 +147,7 @@ def test_a_body_at_rest_is_not_tinted_though_its_field_is_rounded(subject, name)
     )
     still = replace(
         subject,
-        scene=SceneFile.model_validate(toml_of(text)),
+        scene=SceneFile.model_validate(tomllib.loads(text)),
         nodes=lambda index: subject.rest.nodes + noise[index],
         times=np.arange(3) / 10,
         von_mises=lambda index: 1e6 * abs(noise[index, :, 0]),

@@ -6,6 +6,7 @@ its root, so that bodies of all sizes move alike.
 
 import argparse
 import json
+import tomllib
 from pathlib import Path
 from shlex import quote
 
@@ -21,7 +22,6 @@ from msmpetsc.geometry.surface import check_encloses, examine
 from msmpetsc.results.disk import write_whole
 from msmpetsc.scene.key_table import SCHEMA_FILE, json_schema
 from msmpetsc.scene.reading import lies_below, scene_of
-from msmpetsc.scene.toml import toml_of
 
 # folder of the shipped scenes, which a wheel also has; in a clone a link to scenes/
 SHIPPED = Path(msmpetsc.__file__).parent / "shipped"
@@ -148,7 +148,10 @@ def shipped_titles() -> dict[str, str]:
     files = sorted(SHIPPED.glob("*.toml"))
     if not files:
         raise InputError(f"{SHIPPED} has no scenes: this msmpetsc was installed without them")
-    return {path.stem: toml_of(path.read_text(encoding="utf-8")).get("title", "") for path in files}
+    return {
+        path.stem: tomllib.loads(path.read_text(encoding="utf-8")).get("title", "")
+        for path in files
+    }
 
 
 def shipped_text(name: str) -> str:

@@ -111,7 +111,7 @@ def shares_by_mass(comm: "MPI.Comm", where: Mask, mass: Floats) -> Rows:
 class ExternalForces(NamedTuple):
     """External forces at a time, or their means over a time.
 
-    force     : (owned, 3) [N] that do not depend on positions, as a read-only array
+    force     : (owned, 3) [N] that do not depend on positions
     pressures : pressures, whose forces follow the surface
     """
 
@@ -141,8 +141,6 @@ class ActingForces:
         self.pressures = pressures
         self.all: list[Varying] = [*loads, *own_forces, *pressures]
         self._own = [np.zeros((0, 3))] * len(own_forces)
-        self._totals: list[tuple[float, ...]] = []
-        self._load = np.zeros((lattice.owned, 3), like=lattice.nodes)
 
     def begin_step(self, q: Positions, v: Rows, time: float) -> None:
         """Evaluate the users' force functions at the state at which a step begins.
@@ -183,14 +181,9 @@ class ActingForces:
 
     def _with(self, total: Callable[[Varying], Floats], users: bool = True) -> ExternalForces:
         """Return the external forces with these totals of each load."""
-        totals = [tuple(total(load).tolist()) for load in self.loads]
-        if totals != self._totals:
-            self._totals = totals
-            self._load = np.zeros((self.lattice.owned, 3), like=self.lattice.nodes)
-            for load, vector in zip(self.loads, totals, strict=True):
-                if any(vector):
-                    self._load += load.share * like(load.share, np.array(vector))
-        force = self._load
+        force = np.zeros((self.lattice.owned, 3), like=self.lattice.nodes)
+        for load in self.loads:
+            force += load.share * like(load.share, total(load))
         for function, own in zip(self.own_forces, self._own, strict=True):
             share = float(total(function)[0])
             if users and share and len(own):

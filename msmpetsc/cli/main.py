@@ -21,7 +21,6 @@ from typing import Any, NoReturn
 
 import msmpetsc
 from msmpetsc.app.abort import ending_together, logged_on_root
-from msmpetsc.app.checks import SCENE_NAMES
 from msmpetsc.app.ranks import world
 from msmpetsc.cli.command_table import COMMANDS, VERBOSITY, Shown
 from msmpetsc.errors import (
@@ -30,7 +29,6 @@ from msmpetsc.errors import (
     InputError,
     MsmpetscError,
     did_you_mean,
-    printable,
 )
 
 # commands that need the packages of the extra "render" only
@@ -128,15 +126,6 @@ def _open_closed_streams() -> None:
 def parsed(words: list[str]) -> argparse.Namespace:
     """Return the parsed arguments of a command line with PETSc options. Raises InputError."""
     ours, petsc = split_petsc_options(words)
-    if ours and ours[0] not in COMMANDS and not ours[0].startswith("-"):
-        word = printable(ours[0], 60)
-        if word.endswith(SCENE_NAMES):
-            raise InputError(
-                f"{word} is no command, did you mean 'msmpetsc run {shlex.quote(word)}'?"
-            )
-        raise InputError(
-            f"{word} is no command{did_you_mean(word, COMMANDS) or ': ' + ', '.join(COMMANDS)}"
-        )
     _refuse_one_dash(ours, petsc)
     args, unknown = command_parser().parse_known_args(
         ours, argparse.Namespace(petsc_options=shlex.join(petsc))

@@ -38,14 +38,11 @@ def test_every_command_has_examples_that_are_command_lines(capsys):
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["rnu", "scene.toml"], "rnu is no command, did you mean 'run'?"),
-        (["comparee"], "did you mean 'compare'?"),
-        (["scene.toml"], "did you mean 'msmpetsc run scene.toml'?"),
-        (["xyzzy"], "xyzzy is no command: new, run, "),
+        (["rnu", "scene.toml"], "invalid choice: 'rnu' (choose from"),
         ([], "required: COMMAND"),
     ],
 )
-def test_a_mistaken_command_is_told_the_one_that_is_meant(words: list[str], expected: str):
+def test_a_mistaken_command_is_told_all_commands(words: list[str], expected: str):
     assert expected in command_error(*words)
 
 

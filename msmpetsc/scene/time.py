@@ -101,69 +101,48 @@ def _loads(tables: dict[str, Any]) -> Iterator[dict[str, Any]]:
 def unlike_the_integrator(scene: Any) -> Iterator[Broken]:
     """Yield the broken rules between the integrator and other tables."""
     integrator = scene.time.integrator
-    if scene.material.retardation_time and integrator not in IMPLICIT:
-        words = (
-            f'may not have integrator = "{integrator}" with material.retardation_time: use '
-            '"implicit-euler" or "bdf2"'
-        )
-        yield "time", rule(words)
+    if integrator not in IMPLICIT:
+        words = f'is for time.integrator = "implicit-euler" or "bdf2" only, not "{integrator}"'
+        if scene.material.retardation_time:
+            yield "material", rule(f"retardation_time {words}")
+        if scene.self_contact:
+            yield "self_contact", rule(words)
+        elif scene.touching:
+            yield "obstacle", rule(f'response = "barrier" {words}')
     if integrator == STATIC:
         yield from _broken_by_statics(scene)
-    if scene.touching and integrator not in IMPLICIT:
-        words = f'is for time.integrator = "implicit-euler" or "bdf2" only, not "{integrator}"'
-        barrier = "" if scene.self_contact else 'with response = "barrier" '
-        yield "self_contact" if scene.self_contact else "obstacle", rule(barrier + words)
-    for number, obstacle in enumerate(scene.obstacle):
-        if obstacle.response != "exchange":
-            continue
-        # BDF2 would see the nodes that "exchange" moves back
-        if integrator == "bdf2":
-            words = (
-                f'may not have response = "exchange" with time.integrator = "bdf2", as '
-                f"obstacle.{number} has: it moves nodes back by one step; use "
-                'response = "reflect" or "penalty"'
-            )
-            yield "obstacle", rule(words)
-        if scene.touching:
-            words = (
-                f'may not have response = "exchange" with surface contact, as obstacle.{number} '
-                'has: it moves nodes past each other; use response = "reflect" or "penalty"'
-            )
-            yield "obstacle", rule(words)
+    # nodes that "exchange" moves back confuse BDF2's history, and pass each other
+    if integrator == "bdf2" or scene.touching:
+        for number, obstacle in enumerate(scene.obstacle):
+            if obstacle.response == "exchange":
+                words = (
+                    f'may not have response = "exchange" with "bdf2" or surface contact, as '
+                    f'obstacle.{number} has: use response = "reflect" or "penalty"'
+                )
+                yield "obstacle", rule(words)
 
 
 def _broken_by_statics(scene: Any) -> Iterator[Broken]:
     """Yield the broken rules of a static scene: damping, velocities, force functions, impacts."""
+    static = f'with time.integrator = "{STATIC}"'
     if scene.material.damping:
-        words = f'may not have integrator = "{STATIC}" with material.damping: nothing moves'
-        yield "time", rule(words)
+        yield "material", rule(f"may have no damping {static}: nothing moves")
     bodies = [("body", f"body.{number}.", body) for number, body in enumerate(scene.body)]
     for key, prefix, tables in [("", "", scene), *bodies]:
         if tables.start is not None and tables.start.moves:
-            words = (
-                f"{key and f'{prefix}start '}may have no velocity, spin, gradient or swirl with "
-                f'time.integrator = "{STATIC}": there is no inertia'
-            )
+            words = f"{prefix}start may have no velocity, spin, gradient or swirl {static}"
             yield key or "start", rule(words)
         for number, force in enumerate(tables.force):
             if force.function is not None:
                 words = (
-                    f'may be no function with time.integrator = "{STATIC}", as '
-                    f"{prefix}force.{number} is: it is evaluated at the previous state, so the "
-                    "static state would not balance it"
+                    f"{prefix}force.{number} may be no function {static}: it is evaluated at the "
+                    "previous state, so the static state would not balance it"
                 )
                 yield key or "force", rule(words)
     for number, obstacle in enumerate(scene.obstacle):
         if obstacle.response not in ("penalty", "barrier"):
-            words = (
-                f'may not {obstacle.response} with time.integrator = "{STATIC}", as '
-                f'obstacle.{number} does: nothing strikes it; use response = "penalty"'
-            )
+            words = f'obstacle.{number} needs response = "penalty" {static}: nothing strikes it'
             yield "obstacle", rule(words)
         if obstacle.friction:
-            words = (
-                f'may have no friction with time.integrator = "{STATIC}", as obstacle.{number} '
-                "has: friction depends on the motion; use an implicit integrator with "
-                "material.damping"
-            )
+            words = f"obstacle.{number} may have no friction {static}: it depends on the motion"
             yield "obstacle", rule(words)

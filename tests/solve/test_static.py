@@ -105,7 +105,7 @@ PLANE = plane_at()
 OF_MOTION = {
     "no velocity": {"start": {"velocity": [0.0, 0.0, 1.0]}},
     "gradient or swirl": {"start": {"gradient": [[0, 1, 0]] * 3}},
-    "may not reflect": {"obstacle": [PLANE]},
+    "nothing strikes it": {"obstacle": [PLANE]},
     "no friction": {"obstacle": [PLANE | {"response": "penalty", "friction": 0.1}]},
 }
 

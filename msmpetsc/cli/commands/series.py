@@ -35,10 +35,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def columns_of(run: Result, scene: SceneFile) -> Iterator[tuple[str, Floats]]:
-    """Yield name with unit and values (T,) of each column, the time first.
-
-    Raises InputError if the result does not fit its scene.
-    """
+    """Yield name with unit and values (T,) of each column, the time first."""
     yield "time [s]", run.frames.time[:]
     names = {
         "reaction": [table.key for table in holders_of(scene)],
@@ -51,11 +48,6 @@ def columns_of(run: Result, scene: SceneFile) -> Iterator[tuple[str, Floats]]:
     for name in filter(run.frames.__contains__, SERIES):
         array = run.frames[name]
         row_names = names.get(name, [""])
-        if array.ndim == 3 and array.shape[1] != len(row_names):
-            raise InputError(
-                f"{run.path} is damaged: {array.name} has {array.shape[1]} rows for "
-                f"{len(row_names)} tables"
-            )
         axes = ("x", "y", "z") if array.ndim > 1 else ("",)
         values = array[:].reshape(len(array), len(row_names), len(axes))
         for row, row_name in enumerate(row_names):

@@ -49,7 +49,7 @@ from msmpetsc.lattice.topology import topology_of
 from msmpetsc.scene.motion import Gravity, Traction
 from msmpetsc.scene.obstacles import BARRIER, ObstacleTable
 from msmpetsc.scene.reading import Scene
-from msmpetsc.scene.schema import OfBody, holders_of, surface_loads
+from msmpetsc.scene.schema import HOLDERS, SURFACE_LOADS, OfBody
 
 # range of a body's longest side [m]; its fourth power stays within a double
 SIDE_LIMITS = 1e-60, 1e60
@@ -200,11 +200,13 @@ def build_model(
     finder = Finder(bodies, cages, scene.folder)
     materials = cell_materials(scene, finder)
     lattice = build_lattice(cages, scene.material, materials, geometry.topology)
-    tables = [table for kind in ("pin", "anchor", "force") for table in scene.tables(kind)]
+    tables = [*scene.tables(*HOLDERS, "force")]
     own = NodePoints(lattice.nodes, np.zeros(len(lattice.nodes), bool))
     nearest = geometry.nearest if tables else own
     masks = {table.key: finder.find(table, lattice, nearest) for table in tables}
-    components = {t.key: masks[t.key][:, None] & np.array(t.table.fixed) for t in holders_of(scene)}
+    components = {
+        t.key: masks[t.key][:, None] & np.array(t.table.fixed) for t in scene.tables(*HOLDERS)
+    }
     lattice = lattice.pin(
         reduce(np.logical_or, (components[pin.key] for pin in scene.tables("pin")), lattice.fixed)
     )
@@ -221,9 +223,7 @@ def build_model(
     exchanges, penalties = _contacts(comm, scene.obstacle, lattice, finder.bounds, obstacles)
     model = Model(
         surface=joined([body.surface for body in bodies if body.surface is not None]),
-        lattice=clamped(
-            scene, lattice, masks, finder, nearest.points if nearest else lattice.nodes
-        ),
+        lattice=clamped(scene, lattice, masks, finder, nearest.points),
         embedding=geometry.embedding if scene.output.surface else None,
         loads=loads,
         own_forces=own_forces,
@@ -414,7 +414,7 @@ def _surface_loads(
     Raises InputError for a region without triangles, or a pressure without a potential.
     """
     tractions, pressures = [], []
-    for table in surface_loads(scene):
+    for table in scene.tables(*SURFACE_LOADS):
         part, load = surface_part(table, finder, lattice), table.table
         acts = {"start": load.start, "stop": load.stop, "total": total_of(load.value)}
         if isinstance(load, Traction):

@@ -25,8 +25,11 @@ from msmpetsc.scene.values import (
 
 # largest ratio of stiffnesses or densities in a scene [-]; so that CG converges
 MAX_CONTRAST = 1e6
+# tables that hold nodes: a node in several tables belongs to the first
+HOLDERS = ("pin", "anchor")
+SURFACE_LOADS = ("traction", "pressure")
 # tables with a region, of a body or of the whole scene
-OF_REGIONS = ("part", "pin", "anchor", "force", "traction", "pressure")
+OF_REGIONS = ("part", *HOLDERS, "force", *SURFACE_LOADS)
 
 
 class BodyTable(Table):
@@ -62,18 +65,6 @@ class OfBody(NamedTuple):
     def key(self) -> str:
         """Return the key path as a string, for example "body.1.pin.0"."""
         return ".".join(map(str, self.path))
-
-
-def holders_of(scene: Any) -> Iterator[OfBody]:
-    """Yield the tables of pins, then of anchors. A node in several tables belongs to the first."""
-    for kind in ("pin", "anchor"):
-        yield from scene.tables(kind)
-
-
-def surface_loads(scene: Any) -> Iterator[OfBody]:
-    """Yield the tables of tractions, then of pressures."""
-    for kind in ("traction", "pressure"):
-        yield from scene.tables(kind)
 
 
 def unlike_the_material(scene: Any) -> Iterator[Broken]:
@@ -283,13 +274,14 @@ class SceneFile(Table):
         """Return the start table of each body, None for a body at rest."""
         return [body.start or self.start for body in self.body] or [self.start]
 
-    def tables(self, kind: str) -> Iterator[OfBody]:
-        """Yield the tables of a kind: the scene's own, for all bodies, then those of each body."""
-        for number, table in enumerate(getattr(self, kind)):
-            yield OfBody((kind, number), None, table)
-        for body, tables in enumerate(self.body):
-            for number, table in enumerate(getattr(tables, kind)):
-                yield OfBody(("body", body, kind, number), body, table)
+    def tables(self, *kinds: str) -> Iterator[OfBody]:
+        """Yield the tables of each kind: the scene's own, for all bodies, then those of bodies."""
+        for kind in kinds:
+            for number, table in enumerate(getattr(self, kind)):
+                yield OfBody((kind, number), None, table)
+            for body, tables in enumerate(self.body):
+                for number, table in enumerate(getattr(tables, kind)):
+                    yield OfBody(("body", body, kind, number), body, table)
 
     def named_files(self) -> Iterator[tuple[KeyPath, str]]:
         """Yield key path and name of each file; the name of a mesh may be a registry name."""
@@ -306,6 +298,6 @@ class SceneFile(Table):
         for keys, start in starts.items():
             if start is not None and start.from_ is not None:
                 yield (*keys, "from"), start.from_
-        for path, _, table in chain.from_iterable(self.tables(kind) for kind in OF_REGIONS):
+        for path, _, table in self.tables(*OF_REGIONS):
             if isinstance(table.region.painted, str):
                 yield (*path, "region", "painted"), table.region.painted

@@ -22,7 +22,7 @@ from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.fields import FRAME_FIELDS, STRESS, Frame
 from msmpetsc.lattice.embedded_surface import EmbeddedPoints
 from msmpetsc.scene.reading import Scene
-from msmpetsc.scene.schema import Solver, holders_of
+from msmpetsc.scene.schema import HOLDERS, Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.instrumentation import REFERENCE_PREFIX, REFERENCE_PRESET, Monitors, TrueErrors
@@ -80,7 +80,7 @@ def refuse_bad_options(
         raise InputError(
             f"contact of surfaces needs one of newton's presets, not {scene.solver.preset}"
         )
-    rolls = [table.key for table in holders_of(scene) if not all(table.table.fixed)]
+    rolls = [table.key for table in scene.tables(*HOLDERS) if not all(table.table.fixed)]
     if rolls and not all(preset.true_hessian for preset, _ in solvers.values()):
         raise InputError(
             f"{rolls[0]}.fix: single components need one of newton's presets, not "

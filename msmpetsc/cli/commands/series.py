@@ -11,7 +11,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.results.disk import write_whole
 from msmpetsc.results.reader import Result
 from msmpetsc.results.untrusted_file import plain_damage
-from msmpetsc.scene.schema import SceneFile, holders_of, surface_loads
+from msmpetsc.scene.schema import HOLDERS, SURFACE_LOADS, SceneFile
 from msmpetsc.view.drawable import read_scene
 
 SERIES = (
@@ -38,11 +38,11 @@ def columns_of(run: Result, scene: SceneFile) -> Iterator[tuple[str, Floats]]:
     """Yield name with unit and values (T,) of each column, the time first."""
     yield "time [s]", run.frames.time[:]
     names = {
-        "reaction": [table.key for table in holders_of(scene)],
-        "torque": [table.key for table in holders_of(scene)],
+        "reaction": [table.key for table in scene.tables(*HOLDERS)],
+        "torque": [table.key for table in scene.tables(*HOLDERS)],
         "push": [f"obstacle.{number}" for number in range(len(scene.obstacle))],
         "contact_push": [f"body.{number}" for number in range(max(1, len(scene.body)))],
-        "surface_load": [table.key for table in surface_loads(scene)],
+        "surface_load": [table.key for table in scene.tables(*SURFACE_LOADS)],
         "probe": [probe.name for probe in scene.output.probe],
     }
     for name in filter(run.frames.__contains__, SERIES):

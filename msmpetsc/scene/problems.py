@@ -62,8 +62,5 @@ def as_given(value: Any) -> str:
         # the repr of a NumPy 2 scalar includes its type
         shown = repr(float(value))
     else:
-        try:
-            shown = json.dumps(value, ensure_ascii=False, default=str)
-        except (ValueError, RecursionError):
-            return "a value too long to show"
+        shown = json.dumps(value, ensure_ascii=False, default=str)
     return printable(shown, 60) if len(shown) <= 60 else printable(shown, 57) + "..."

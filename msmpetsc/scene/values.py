@@ -36,12 +36,6 @@ def _unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:
     return x / length, y / length, z / length
 
 
-def _distinct(components: tuple[str, ...]) -> tuple[str, ...]:
-    if not components or len(set(components)) < len(components):
-        raise rule("must name one to three components, each once")
-    return components
-
-
 # below 1e60, so that the fourth power is finite
 Positive = Annotated[float, Field(gt=0, lt=1e60)]
 NotNegative = Annotated[float, Field(ge=0, lt=1e60)]
@@ -52,7 +46,7 @@ T = TypeVar("T")
 ListOf = Annotated[tuple[T, ...], Strict(False)]
 Vector = Annotated[tuple[float, float, float], Strict(False)]
 Direction = Annotated[Vector, AfterValidator(_nonzero)]
-Components = Annotated[tuple[Literal["x", "y", "z"], ...], Strict(False), AfterValidator(_distinct)]
+Components = Annotated[tuple[Literal["x", "y", "z"], ...], Strict(False), Field(min_length=1)]
 UnitVector = Annotated[Vector, AfterValidator(_unit)]
 
 

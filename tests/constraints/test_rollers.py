@@ -187,15 +187,11 @@ def test_a_slab_between_walls_falls_freely(tmp_path: Path):
     assert (q[..., 1] == q[0, :, 1]).all()
 
 
-ONCE = "pin.0.fix: must name one to three components, each once, got"
-
-
 @pytest.mark.parametrize(
     ("pin", "time", "message"),
     [
-        ({"fix": ["x", "x"]}, {}, ONCE),
         ({"fix": ["w"]}, {}, "pin.0.fix.0: must be 'x', 'y' or 'z'"),
-        ({"fix": []}, {}, ONCE),
+        ({"fix": []}, {}, "pin.0.fix: must have at least 1 item"),
         ({"fix": ["x", "z"]}, {"integrator": "static"}, "the body is held by nothing along y"),
     ],
 )

@@ -91,7 +91,7 @@ def test_changes_are_checked_as_a_file_is(scene: Path):
             simulation.frames(frames)
     with pytest.raises(InputError, match="unknown preset 'newtno', did you mean 'newton'"):
         next(simulation.frames(set={"solver.preset": "newtno"}))
-    with pytest.raises(InputError, match="scene: must give exactly one of mesh, body"):
+    with pytest.raises(InputError, match="scene: material: required, but missing"):
         msm.Scene.of({"cages": {"count": 3}})
 
 

@@ -46,7 +46,7 @@ FIXED = (
     "output.probe",
 )
 # fields of a scene that do not affect the run
-IGNORED_FIELDS = {"text", "folder", "title", "picture"}
+IGNORED = {"text", "folder", "title", "picture"}
 
 
 def earlier_run(
@@ -157,8 +157,10 @@ class Resumed:
         was = _with_an_effect(_stored(earlier))
         now = _with_an_effect(options)
         if "scene" in earlier.texts:
-            was |= flat(scene_of(earlier.path, earlier.texts["scene"], to_read=False))
-            now |= flat(scene)
+            stored = scene_of(earlier.path, earlier.texts["scene"], to_read=False)
+            for values, each in ((was, stored), (now, scene)):
+                leaves = {path: value for path, value in each.leaves() if path[0] not in IGNORED}
+                values |= {".".join(map(str, path)): value for path, value in leaves.items()}
         for key in sorted(was.keys() | now.keys()):
             if was.get(key) != now.get(key):
                 yield f"{key}: {_shown(was.get(key))} in {earlier.path}, {_shown(now.get(key))} now"
@@ -210,24 +212,6 @@ class Resumed:
         simulation.restore(saved)
         time = saved.step * simulation.time_step
         log.info("goes on after step %d of %d (t = %.6g s)", saved.step, simulation.steps, time)
-
-
-def flat(scene: Scene) -> dict[str, Any]:
-    """Return the values of a scene by key, for example "time.step" or "obstacle.0.point"."""
-    return dict(
-        _leaves("", scene.model_dump(exclude=IGNORED_FIELDS, exclude_none=True, by_alias=True))
-    )
-
-
-def _leaves(name: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """Yield key and value of each leaf of nested tables below ``name``."""
-    if isinstance(value, (list, tuple)) and any(isinstance(item, dict) for item in value):
-        value = dict(enumerate(value))
-    if not isinstance(value, dict):
-        yield name, value
-        return
-    for key, inner in value.items():
-        yield from _leaves(f"{name}.{key}".lstrip("."), inner)
 
 
 def _with_an_effect(options: dict[str, str]) -> dict[str, Any]:

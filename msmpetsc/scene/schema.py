@@ -283,21 +283,23 @@ class SceneFile(Table):
                 for number, table in enumerate(getattr(tables, kind)):
                     yield OfBody(("body", body, kind, number), body, table)
 
+    def leaves(self) -> Iterator[tuple[KeyPath, Any]]:
+        """Yield key path and value of each key that is no table."""
+        yield from _leaves((), self.model_dump(exclude_none=True, by_alias=True))
+
     def named_files(self) -> Iterator[tuple[KeyPath, str]]:
         """Yield key path and name of each file; the name of a mesh may be a registry name."""
-        solids = {
-            ("obstacle", number, "mesh"): o.mesh
-            for number, o in enumerate(self.obstacle)
-            if o.mesh is not None
-        }
-        for path, mesh in (self.meshes | solids).items():
-            yield (*path, "source"), mesh.source
-        starts = {("start",): self.start} | {
-            ("body", number, "start"): body.start for number, body in enumerate(self.body)
-        }
-        for keys, start in starts.items():
-            if start is not None and start.from_ is not None:
-                yield (*keys, "from"), start.from_
-        for path, _, table in self.tables(*OF_REGIONS):
-            if isinstance(table.region.painted, str):
-                yield (*path, "region", "painted"), table.region.painted
+        for path, value in self.leaves():
+            if path[-1] in ("source", "from", "painted") and isinstance(value, str):
+                yield path, value
+
+
+def _leaves(path: KeyPath, value: Any) -> Iterator[tuple[KeyPath, Any]]:
+    """Yield key path and value of each leaf of nested tables."""
+    if isinstance(value, (list, tuple)) and any(isinstance(item, dict) for item in value):
+        value = dict(enumerate(value))
+    if not isinstance(value, dict):
+        yield path, value
+        return
+    for key, inner in value.items():
+        yield from _leaves((*path, key), inner)

@@ -8,7 +8,7 @@ import math
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, field, is_dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -31,18 +31,11 @@ FINITE: Range = (-sys.float_info.max, sys.float_info.max)
 LENGTH: Range = (0.0, sys.float_info.max)
 
 
-class Counting(Protocol):
-    """A part of a run with counters that a checkpoint stores.
+def _numbers(part: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the stored name and the value of each counter of a part of a run.
 
-    state : name and range of each stored attribute, a number or a dataclass of numbers
+    ``part.state`` has name and range of each stored attribute, a number or a dataclass of numbers.
     """
-
-    @property
-    def state(self) -> dict[str, Range]: ...
-
-
-def _numbers(part: Counting) -> Iterator[tuple[str, Any]]:
-    """Yield the stored name and the value of each counter of a part."""
     for attribute in part.state:
         value = getattr(part, attribute)
         inner = vars(value) if is_dataclass(value) else {"": value}
@@ -69,11 +62,11 @@ class Checkpoint:
         self.rows |= rows or {}
         self.numbers |= numbers or {}
 
-    def keep_counts(self, part: Counting) -> None:
+    def keep_counts(self, part: Any) -> None:
         """Add the counters of a part to the checkpoint."""
         self.keep(numbers=dict(_numbers(part)))
 
-    def restore_counts(self, part: Counting) -> None:
+    def restore_counts(self, part: Any) -> None:
         """Set the counters of a part to their stored values; raise InputError out of range."""
         for attribute, bounds in part.state.items():
             value = getattr(part, attribute)

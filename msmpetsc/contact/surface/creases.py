@@ -7,10 +7,10 @@ farther apart on the surface push from dhat, however close they are at rest.
 """
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array, triu
 
 from msmpetsc.backend.arrays import Indices, Positions
 
@@ -35,13 +35,19 @@ def neighbours(
     Neighbours are candidate pairs closer than ``distance`` [m] at rest, with parts at most RINGS
     rings of triangles apart.
     """
-    of_points = _cross_pairs(
-        candidates.fv_candidates, mesh, points, distance, [(0, 1), (0, 2), (0, 3), (0, 3)]
+    at = np.asfortranarray(points), mesh.edges, mesh.faces
+    kinds = (
+        (candidates.fv_candidates, [(0, 1), (0, 2), (0, 3), (0, 3)]),
+        (candidates.ee_candidates, [(0, 2), (0, 3), (1, 2), (1, 3)]),
     )
-    of_edges = _cross_pairs(
-        candidates.ee_candidates, mesh, points, distance, [(0, 2), (0, 3), (1, 2), (1, 3)]
+    # (k, 4, 2) points of candidates that are near, one of either part
+    near = (
+        np.reshape(
+            [c.vertex_ids(*at[1:]) for c in kind if c.compute_distance(*at) < distance**2], (-1, 4)
+        ).astype(int)[:, cross]
+        for kind, cross in kinds
     )
-    groups = np.concatenate([of_points, of_edges])
+    groups = np.concatenate(list(near))
     if len(groups) == 0:
         return {}
     edges = np.concatenate(
@@ -52,26 +58,9 @@ def neighbours(
     for _ in range(RINGS - 1):
         within = within @ ring
     first, second = groups.reshape(-1, 2).T
-    near = np.asarray(within.tocsr()[first, second]).reshape(-1, 4) > 0
-    local = np.sort(groups[near.any(axis=1)].reshape(-1, 2), axis=1)
+    local = np.asarray(within.tocsr()[first, second]).reshape(-1, 4).any(axis=1)
+    local = np.sort(groups[local].reshape(-1, 2), axis=1)
     return {(int(i), int(j)): False for i, j in np.unique(local, axis=0) if i < j}
-
-
-def _cross_pairs(
-    kind: list[Any], mesh: Any, points: Positions, distance: float, cross: list[Any]
-) -> Indices:
-    """Return pairs (k, 4, 2) of points, one of either part, for each candidate closer than
-    ``distance``.
-
-    cross : places of the points in a candidate; a point and a triangle have three pairs, one twice
-    """
-    points, edges, faces = np.asfortranarray(points), mesh.edges, mesh.faces
-    near = [
-        c.vertex_ids(edges, faces)
-        for c in kind
-        if c.compute_distance(points, edges, faces) < distance**2
-    ]
-    return np.array(near, np.int64).reshape(-1, 4)[:, cross]
 
 
 def creases(
@@ -82,7 +71,8 @@ def creases(
 ) -> tuple[dict[float, "ipctk.Candidates"], int]:
     """Return the pairs of creases by their distance [m], and the number of pairs too close for any.
 
-    The greatest distance comes first.
+    The greatest distance comes first. Parts of a pair, a point and a triangle or two edges, are
+    neighbours if each point of one is a neighbour of each point of the other.
 
     near     : {(i, j): False} of the points of neighbours
     points   : (p, 3) [m] at rest
@@ -90,57 +80,32 @@ def creases(
     """
     import ipctk
 
-    points, pairs = np.asfortranarray(points), _left_out(near, mesh, len(points))
-    squares = [pair.compute_distance(points, mesh.edges, mesh.faces) for pair in pairs]
-    lengths = np.sqrt(np.array(squares, float)) / distance
-    finer = np.ceil(np.log(ROOM / np.maximum(lengths, NEAREST)) / np.log(FINER)).clip(0).astype(int)
-    finer[lengths < NEAREST] = -1
-    sets = {}
-    for level in np.unique(finer[finer >= 0]):
-        candidates = sets[distance / FINER ** int(level)] = ipctk.Candidates()
-        chosen = [pairs[i] for i in np.flatnonzero(finer == level)]
-        candidates.fv_candidates = [
-            pair for pair in chosen if isinstance(pair, ipctk.FaceVertexCandidate)
-        ]
-        candidates.ee_candidates = [
-            pair for pair in chosen if isinstance(pair, ipctk.EdgeEdgeCandidate)
-        ]
-    return sets, int((finer < 0).sum())
-
-
-def _left_out(
-    near: Mapping[tuple[int, int], bool], mesh: "ipctk.CollisionMesh", points: int
-) -> list["ipctk.FaceVertexCandidate | ipctk.EdgeEdgeCandidate"]:
-    """Return the pairs of parts, a point and a triangle or two edges, whose points are neighbours.
-
-    Each point of one part is a neighbour of each point of the other part.
-    """
-    import ipctk
-
     if not near:
-        return []
-    ends = np.array(list(near)).T
-    met = coo_array(
-        (np.ones(2 * ends.shape[1]), np.hstack([ends, ends[::-1]])), shape=(points, points)
-    ).tocsr()
-    # (k, points) incidence of points in triangles, and in edges
-    corners = []
-    for part in (mesh.faces, mesh.edges):
-        rows = np.repeat(np.arange(len(part)), part.shape[1])
-        corners.append(
-            coo_array((np.ones(part.size), (rows, part.ravel())), shape=(len(part), points)).tocsr()
-        )
-    faces, edges = corners
-    of_point, of_edge = (faces @ met).tocoo(), (edges @ met @ edges.T).tocoo()
-    all_three, all_four = of_point.data == 3, (of_edge.data == 4) & (of_edge.row < of_edge.col)
-    of_points = map(
-        ipctk.FaceVertexCandidate,
-        of_point.row[all_three].tolist(),
-        of_point.col[all_three].tolist(),
-    )
-    return [
-        *of_points,
-        *map(
-            ipctk.EdgeEdgeCandidate, of_edge.row[all_four].tolist(), of_edge.col[all_four].tolist()
-        ),
-    ]
+        return {}, 0
+    ends, sets, dropped = np.array(list(near)).T, {}, 0
+    shape = (len(points),) * 2
+    met = coo_array((np.ones(2 * len(near)), np.hstack([ends, ends[::-1]])), shape=shape).tocsr()
+    faces, edges = (_incidence(part, len(points)) for part in (mesh.faces, mesh.edges))
+    of_points, of_edges = (faces @ met).tocoo(), triu(edges @ met @ edges.T, 1, "coo")
+    for name, kind, joined, most in (
+        ("fv_candidates", ipctk.FaceVertexCandidate, of_points, 3),
+        ("ee_candidates", ipctk.EdgeEdgeCandidate, of_edges, 4),
+    ):
+        rows, columns = (of[joined.data == most].tolist() for of in (joined.row, joined.col))
+        pairs = list(map(kind, rows, columns))
+        at = np.asfortranarray(points), mesh.edges, mesh.faces
+        squares = np.array([pair.compute_distance(*at) for pair in pairs], float)
+        ratios = np.sqrt(squares) / distance
+        finer = np.ceil(np.log(ROOM / np.maximum(ratios, NEAREST)) / np.log(FINER)).clip(0)
+        finer[ratios < NEAREST] = -1
+        dropped += int((finer < 0).sum())
+        for level in np.unique(finer[finer >= 0]):
+            candidates = sets.setdefault(distance / FINER**level, ipctk.Candidates())
+            setattr(candidates, name, [pairs[i] for i in np.flatnonzero(finer == level)])
+    return dict(sorted(sets.items(), reverse=True)), dropped
+
+
+def _incidence(parts: Indices, points: int) -> csr_array:
+    """Return the incidence (k, points) of points in parts (k, n)."""
+    rows = np.repeat(np.arange(len(parts)), parts.shape[1])
+    return csr_array((np.ones(parts.size), (rows, parts.ravel())), shape=(len(parts), points))

@@ -89,9 +89,8 @@ class BarrierLaw:
 class Barrier:
     """Barrier of a surface, by positions S (p, 3) [m] of its points.
 
-    bodies        : number of points of bodies, which come first; obstacles do not meet each other
-    edge          : mean length of the bodies' edges at rest [m]
-    last_friction : points (p, 3) at which pairs with friction were computed last, and these pairs
+    bodies : number of points of bodies, which come first; obstacles do not meet each other
+    edge   : mean length of the bodies' edges at rest [m]
     """
 
     def __init__(self, surface: Surface, law: BarrierLaw, bodies: int, meets_itself: bool = True):
@@ -120,7 +119,6 @@ class Barrier:
         self.creases: CandidateSets = (CandidateSet(ipctk.Candidates()),)
         # Pairs of creases by kind, with their points (k, 4)
         self._creased: list[list[tuple[list[Any], Indices]]] = []
-        self.last_friction: tuple[Positions, FrictionPairs] | None = None
 
     def _potential(self, distance: float) -> "ipctk.BarrierPotential":
         """Return the barrier of a distance [m], with the law's stiffness over a depth."""
@@ -333,19 +331,12 @@ class Barrier:
         return pairs.numbers, self.law.friction * pairs.push
 
     def _friction_pairs(self, contacts: ContactSets, points: Positions) -> FrictionPairs:
-        """Return the pairs with friction at points (p, 3) [m].
-
-        A step begins with the pairs that the last step ended with.
-        """
-        if self.last_friction is None or not np.array_equal(self.last_friction[0], points):
-            collisions = []
-            for potential, pairs in self._pushing(contacts):
-                collisions.append(self.ipctk.TangentialCollisions())
-                collisions[-1].build(
-                    self.mesh, np.asfortranarray(points), pairs, potential, self.law.friction
-                )
-            self.last_friction = points, friction_pairs(collisions, self.mesh)
-        return self.last_friction[1]
+        """Return the pairs with friction at points (p, 3) [m]."""
+        collisions, at = [], np.asfortranarray(points)
+        for potential, pairs in self._pushing(contacts):
+            collisions.append(self.ipctk.TangentialCollisions())
+            collisions[-1].build(self.mesh, at, pairs, potential, self.law.friction)
+        return friction_pairs(collisions, self.mesh)
 
     def least(self, contacts: ContactSets, points: Positions) -> float:
         """Return the least distance [m]; infinite without contacts."""

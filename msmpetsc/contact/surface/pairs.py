@@ -195,8 +195,6 @@ class CandidateCache:
     def forget(self) -> None:
         """Forget all candidates, so that the next step does not depend on earlier steps."""
         self._known = []
-        if self.barrier:
-            self.barrier.last_friction = None
 
 
 class ContactSearch:

@@ -212,11 +212,8 @@ def _share_farther_than(surface: Surface, reference: Surface, distance: float) -
 
 
 @about_middle
-def simplify(surface: Surface, faces: int, aggressiveness: int = 7) -> Surface:
-    """Reduce to about ``faces`` triangles (quadric decimation); a closed surface stays closed.
-
-    aggressiveness : of fast_simplification; less is slower and stays closer to the surface
-    """
+def simplify(surface: Surface, faces: int) -> Surface:
+    """Reduce to about ``faces`` triangles (quadric decimation); a closed surface stays closed."""
     surface = merge(surface)
     if faces >= len(surface.triangles):
         return surface
@@ -224,7 +221,7 @@ def simplify(surface: Surface, faces: int, aggressiveness: int = 7) -> Surface:
     import fast_simplification
 
     points, triangles = fast_simplification.simplify(
-        surface.points, surface.triangles, target_count=int(faces), agg=aggressiveness
+        surface.points, surface.triangles, target_count=int(faces)
     )
     reduced = Surface(np.asarray(points, np.float64), np.asarray(triangles, np.int64))
     used, _ = edge_use(merged_triangles(reduced))

@@ -28,12 +28,11 @@ from msmpetsc.geometry.surface import Surface
 # Positions whose contacts and candidates are kept: the base of a line search and its
 # trials
 REMEMBERED = 3
-# Edges that a point may move before a new broad phase; 0.25 has four times the pairs
+# Edges that a point may move before a new broad phase; 0.25 has four times the pairs, and
+# fewer edges do not have fewer pairs
+REACH = 0.02
+# Edges that a point may move in a narrow step
 FARTHEST = 0.05
-# Edges that a point may always move; with fewer the pairs are not fewer
-LEAST = 0.02
-# Moves of the last step that a broad phase allows for, if nothing touched
-AHEAD = 2.0
 # Share of points in contact beyond which second solves cost more than narrow steps save
 FEW = 0.01
 # Relative difference of two sums of contact energy by rounding
@@ -144,7 +143,7 @@ class CandidateCache:
 
     def around(self, q: Positions, time: float) -> CandidatePairs:
         """Return the newest candidates, or those at q if there are none yet."""
-        return self._known[0] if self._known else self.broad_phase(q, time, self.law.distance)
+        return self._known[0] if self._known else self.broad_phase(q, time)
 
     def valid_at(self, *places: Positions) -> CandidatePairs | None:
         """Return the newest candidates that are valid at all these points (p, 3) [m], or None."""
@@ -157,14 +156,9 @@ class CandidateCache:
         self._known.insert(0, self._known.pop(number))
         return self._known[0]
 
-    def broad_phase(
-        self, q: Positions, time: float, margin: float, moved: Rows | None = None
-    ) -> CandidatePairs:
+    def broad_phase(self, q: Positions, time: float, moved: Rows | None = None) -> CandidatePairs:
         """Find candidate pairs at q, or on the paths from there by ``moved`` (p, 3) [m]."""
-        points, margin = (
-            self.points(q, time),
-            min(max(margin, LEAST * self.edge), FARTHEST * self.edge),
-        )
+        points, margin = self.points(q, time), REACH * self.edge
         sets: CandidateSets = ()
         clear = 0.0
         if self.barrier:
@@ -230,13 +224,11 @@ class ContactSearch:
         q: Positions,
         time: float | None = None,
         with_points: bool = False,
-        base: Positions | None = None,
     ) -> SurfaceContactsAt:
         """Return the contacts at positions q.
 
         time        : of obstacles [s]; None for the end of the step
         with_points : compute the points even if nothing is near
-        base        : start of a path to q, whose collision-free step is computed next
         """
         q, time = q[: self.owned], self.time if time is None else time
         for moment in self._moments:
@@ -248,7 +240,7 @@ class ContactSearch:
             return SurfaceContactsAt(q, time, 0, np.empty((0, 3)), ())
         points = self.points_at(q, time)
         if bound > pairs.margin and not self.is_narrow:
-            pairs = self.near.valid_at(points) or self._broad_phase(q, time, points, base)
+            pairs = self.near.valid_at(points) or self.near.broad_phase(q, time)
         sets = self._around if self.is_narrow else pairs.sets
         contacts = self.barrier.contacts(sets, points) if self.barrier else ()
         count = self.comm.bcast(sum(map(len, contacts)))
@@ -306,30 +298,14 @@ class ContactSearch:
         """
         known = ContactSummary() if self.is_left_out else self.touch(x, self.time)
         self.widen()
-        pairs, bound = self._bound(q, self.begin, x)
-        ahead = AHEAD * self.near.farthest(x, q, self.time, self.begin)
-        # The next steps then need no broad phase
-        if bound > pairs.margin and ahead <= FARTHEST * self.near.edge:
-            self.near.broad_phase(x, self.time, ahead)
-        self.find(x, base=q)
-        of_all, free = self.touch(x, self.time), self.collision_free_step(q, x, self.begin) == 1.0
+        free = self.collision_free_step(q, x, self.begin) == 1.0
+        of_all = self.touch(x, self.time)
         is_right = (
             free and abs(of_all.energy - known.energy) <= SAME_ENERGY * known.energy + left_out
         )
         if free and not is_right:
             self.narrow(x, self.time)
         return free, is_right
-
-    def _broad_phase(
-        self, q: Positions, time: float, points: Positions, base: Positions | None
-    ) -> CandidatePairs:
-        """Find candidates at q, with points S (p, 3) [m], and on a short path there from base."""
-        moved = None if base is None else self.points_at(base, time) - points
-        if self.comm.bcast(
-            moved is not None and len(moved) > 0 and farthest(moved) > PIECE * self.near.edge
-        ):
-            moved = None
-        return self.near.broad_phase(q, time, LEAST * self.near.edge, moved)
 
     def points_at(self, q: Positions, time: float) -> Positions:
         """Return the points (p, 3) [m] at q and a time [s] on rank 0; (0, 3) elsewhere."""
@@ -408,7 +384,7 @@ class ContactSearch:
                 return float(
                     self.comm.bcast(sweep(self.barrier, start, moved) if self.barrier else 1.0)
                 )
-            sets = (known or self.near.broad_phase(q, begin, LEAST * self.near.edge, moved)).sets
+            sets = (known or self.near.broad_phase(q, begin, moved)).sets
         return float(
             self.comm.bcast(
                 collision_free_step(self.barrier, start, moved, sets) if self.barrier else 1.0

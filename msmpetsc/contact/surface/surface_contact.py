@@ -167,12 +167,9 @@ class SurfaceContact:
         by = self.friction.limit.sum() if self.friction else 0.0
         return np.array([by, barrier.friction_limits(moment.contacts, moment.points)[1].sum()])
 
-    def _acting(self, q: Positions, base: Positions | None = None) -> SurfaceContactsAt | None:
-        """Return the contacts at q, with points for friction; None if nothing acts.
-
-        base : start of a path to q
-        """
-        moment = self.contacts.find(q, with_points=self.has_friction, base=base)
+    def _acting(self, q: Positions) -> SurfaceContactsAt | None:
+        """Return the contacts at q, with points for friction; None if nothing acts."""
+        moment = self.contacts.find(q, with_points=self.has_friction)
         return moment if moment.count or self.has_friction else None
 
     def presses(self, q: Positions) -> bool:
@@ -185,7 +182,7 @@ class SurfaceContact:
         Over a small displacement it is the displacement times the mean force, since a difference
         of energies would lose its digits.
         """
-        before, after = self._acting(base), self._acting(q, base)
+        before, after = self._acting(base), self._acting(q)
         if after is None and before is None:
             return 0.0
         is_small, of_friction = self._is_small(q, base), 0.0

@@ -15,8 +15,6 @@ for each distance.
 ipctk runs on a single thread, so that sums are reproducible. Its arrays are in Fortran's order.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -199,34 +197,7 @@ class Barrier:
         """
         near = self.law.distance + 2 * margin
         pairs = CandidateSet(candidates_on_paths(self.mesh, points, near, moved))
-        cushions = (
-            self._cushion(points, distance + 2 * margin)
-            for distance in self.distances[len(self.creases) :]
-        )
-        return pairs, *self.creases[1:], *cushions
-
-    @contextmanager
-    def cushioned(self, distance: float) -> Iterator[None]:
-        """Let obstacles also push bodies from a larger ``distance`` [m].
-
-        Candidates found before lack the pairs of this distance.
-        """
-        self.distances.append(distance)
-        self.potentials.append(self._potential(distance))
-        try:
-            yield
-        finally:
-            self.distances.pop()
-            self.potentials.pop()
-
-    def _cushion(self, points: Positions, distance: float) -> CandidateSet:
-        """Return the pairs of a body and an obstacle closer than this [m] at points (p, 3) [m]."""
-        mesh, pairs, usual = self.mesh, self.ipctk.Candidates(), self.mesh.can_collide
-        sides = np.repeat([0, 1], [self._bodies, len(points) - self._bodies])
-        mesh.can_collide = self.ipctk.make_vertex_patches_filter(sides)
-        pairs.build(mesh, np.asfortranarray(points), 0.5 * distance, self.ipctk.LBVH())
-        mesh.can_collide = usual
-        return CandidateSet(pairs)
+        return pairs, *self.creases[1:]
 
     def around(self, touched: Mask, points: Positions, margin: float) -> CandidateSets:
         """Return the pairs of parts that have a point in ``touched`` (p,) or next to one.
@@ -357,8 +328,7 @@ class Barrier:
 
     def clearance(self, contacts: ContactSets, sets: CandidateSets, points: Positions) -> float:
         """Return a lower bound [m] of the distances of candidate pairs at points S (p, 3) [m]."""
-        # A larger distance of obstacles has the same pairs
-        known = zip(contacts, sets, self.distances, strict=False)
+        known = zip(contacts, sets, self.distances, strict=True)
         least = (
             self._least(near, points) if len(near) else far
             for near, pairs, far in known

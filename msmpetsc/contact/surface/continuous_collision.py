@@ -95,8 +95,6 @@ def _share_to_crossing(
     """Return the share of paths before the first crossing of candidate pairs."""
     paths = barrier.mesh, np.asfortranarray(start), np.asfortranarray(end), 0.0, barrier.ccd
     shares = (
-        pairs.candidates.compute_collision_free_stepsize(*paths)
-        for pairs in sets[: len(barrier.creases)]
-        if len(pairs)
+        pairs.candidates.compute_collision_free_stepsize(*paths) for pairs in sets if len(pairs)
     )
     return min(shares, default=1.0)

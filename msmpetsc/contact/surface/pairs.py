@@ -10,8 +10,6 @@ Candidate pairs outlive a step (``CandidateCache``). Contacts at positions are k
 points, and all candidates once, at its end.
 """
 
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 
 import numpy as np
@@ -273,21 +271,6 @@ class ContactSearch:
     def widen(self) -> None:
         """Use all candidates."""
         self.is_narrow, self.is_left_out, self._moments = False, False, []
-
-    @contextmanager
-    def cushioned(self, distance: float) -> Iterator[None]:
-        """Let obstacles also push from a larger ``distance`` [m] in the context."""
-        with self.barrier.cushioned(distance) if self.barrier else nullcontext():
-            self._find_anew()
-            try:
-                yield
-            finally:
-                self._find_anew()
-
-    def _find_anew(self) -> None:
-        """Use all candidates, of a new broad phase."""
-        self.widen()
-        self.near.forget()
 
     def check_narrow_step(self, q: Positions, x: Positions, left_out: float) -> tuple[bool, bool]:
         """Return whether the path of a narrow step from q to x is free, and whether x is right.

@@ -6,10 +6,8 @@ step, and s = 1 is the target. Newton's direction towards the minimum of g at s 
     H(x, s) dx = -F(x, s) - (1 - s) dF/ds(x, s),      ds = 1 - s,
 
 until two triangles would cross. So bodies give way to the obstacles that press them, as to the
-moving boundaries of Li et al. (2020, Incremental Potential Contact). Meanwhile obstacles push from
-a larger distance (Barrier.cushioned), which keeps gaps wide and contact soft. The minimisation
-begins at s = 1 with the usual barrier. H is projected, and no line search evaluates g, since the
-path only has to arrive.
+moving boundaries of Li et al. (2020, Incremental Potential Contact). H is projected, and no line
+search evaluates g, since the path only has to arrive.
 
 A start without a linear solve is tried first: nodes move with the obstacles near them.
 """
@@ -18,10 +16,9 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Positions, Rows, greatest
+from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.comm import Stop
 from msmpetsc.contact.surface.pairs import ContactSearch
 from msmpetsc.errors import StepFailed, StepStopped
@@ -78,9 +75,9 @@ class CarriedStart:
             if functional.collision_free_step(problem.q, carried, contacts.begin) == 1.0:
                 return carried
         obstacles.straight = contacts.begin, end
+        contacts.widen()
         try:
-            with contacts.cushioned(self._cushion(contacts)):
-                return self._carry(contacts, end)
+            return self._carry(contacts, end)
         finally:
             contacts.time, functional.problem, obstacles.straight = end, problem, None
 
@@ -94,20 +91,6 @@ class CarriedStart:
         distances = functional.lattice.table.with_ghosts(functional.lattice.ghosts, owned)
         times = contacts.begin, contacts.time
         return contacts.obstacles.carried(q, moved, times, distances, functional.lattice.cell_size)
-
-    def _cushion(self, contacts: ContactSearch) -> float:
-        """Return the distance [m] from which obstacles push.
-
-        It is the longest displacement of an anchor or obstacle along an axis, dhat at least.
-        """
-        problem, obstacles = (
-            self.functional.problem,
-            contacts.obstacles.displacements(contacts.begin, contacts.time),
-        )
-        fixed = self.functional.comm.allreduce(
-            greatest(np.abs(problem.fixed_positions - problem.q)), MPI.MAX
-        )
-        return float(max(fixed, greatest(np.abs(obstacles)), contacts.law.distance))
 
     def _carry(self, contacts: ContactSearch, end: float) -> Positions:
         """Return the start at s = 1 by Newton's directions. Raises StepFailed and StepStopped."""

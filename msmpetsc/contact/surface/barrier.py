@@ -125,10 +125,8 @@ class Barrier:
             self.ipctk.NormalizedClampedLogBarrier(), distance, stiffness
         )
 
-    def leave_out_neighbours(self, points: Positions) -> tuple[int, int]:
-        """Let pairs in creases push only from smaller distances.
-
-        Return the number of these pairs, and of pairs too close to push at all.
+    def leave_out_neighbours(self, points: Positions) -> int:
+        """Let pairs in creases push from smaller distances. Return the number of those too close.
 
         points : (p, 3) at rest [m]
         """
@@ -153,7 +151,7 @@ class Barrier:
             self._creased.append(list(zip(kinds, of, strict=True)))
         self.distances += sets
         self.potentials += [self._potential(distance) for distance in sets]
-        return sum(map(len, self.creases)), dropped
+        return dropped
 
     def crossings(self) -> Indices:
         """Return the triangles (k,) that cross another triangle at rest, ascending."""

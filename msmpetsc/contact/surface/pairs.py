@@ -391,20 +391,10 @@ def farthest(moved: Rows) -> float:
 
 
 def _barrier(surface: Surface, collision: CollisionSurface) -> Barrier:
-    """Return the barrier of a surface, and log its creases."""
+    """Return the barrier of a surface. Warn of pairs that may cross."""
     law = collision.law
     barrier = Barrier(surface, law, collision.points.bodies, collision.meets_itself)
-    folded, dropped = barrier.leave_out_neighbours(surface.points)
-    if folded:
-        log.info(
-            "self_contact: %d pairs of the surface's parts are in creases, nearer than "
-            "self_contact.distance = %.3g m at rest or next to such a pair: they push each other "
-            "from smaller distances, down to %.3g m",
-            folded,
-            law.distance,
-            barrier.distances[-1],
-        )
-    if dropped:
+    if dropped := barrier.leave_out_neighbours(surface.points):
         log.warning(
             "self_contact: %d pairs of the surface's parts in creases all but touch at rest, "
             "nearer than %.3g m: they are left out, and may cross",

@@ -20,7 +20,7 @@ creases. The energy could then be negative.
 """
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
@@ -46,8 +46,6 @@ if TYPE_CHECKING:
 
 # Share of the sum of absolute weights at a place; a smaller sum is rounding.
 ROUNDING = 1e-9
-# Number of collisions kept for later positions; to make one takes 9 us in Python.
-KEPT = 1 << 15
 
 
 @dataclass(frozen=True)
@@ -90,7 +88,6 @@ class Places:
             mesh.num_vertices + mesh.num_edges + mesh.num_faces,
         )
         self._shape = EDGES + 1, self.mesh.size, self.mesh.size, CROSSING + 1
-        self._collision = lru_cache(KEPT)(self._new_collision)
 
     def build(
         self, pairs: CandidateSet, points: Positions, distance: float
@@ -121,7 +118,7 @@ class Places:
         collisions.fv_collisions, collisions.ee_collisions = every[second:third], every[third:]
         return collisions
 
-    def _new_collision(self, place: int, weight: float) -> "ipctk.NormalCollision":
+    def _collision(self, place: int, weight: float) -> "ipctk.NormalCollision":
         """Return a place by its number, in ipctk's form."""
         import ipctk
 

@@ -71,8 +71,8 @@ def creases(
 ) -> tuple[dict[float, "ipctk.Candidates"], int]:
     """Return the pairs of creases by their distance [m], and the number of pairs too close for any.
 
-    The greatest distance comes first. Parts of a pair, a point and a triangle or two edges, are
-    neighbours if each point of one is a neighbour of each point of the other.
+    The greatest distance comes first. A pair is a point and a triangle, or two edges. Each point of
+    one part is a neighbour of each point of the other.
 
     near     : {(i, j): False} of the points of neighbours
     points   : (p, 3) [m] at rest
@@ -82,7 +82,8 @@ def creases(
 
     if not near:
         return {}, 0
-    ends, sets, dropped = np.array(list(near)).T, {}, 0
+    ends, dropped = np.array(list(near)).T, 0
+    sets: dict[float, ipctk.Candidates] = {}
     shape = (len(points),) * 2
     met = coo_array((np.ones(2 * len(near)), np.hstack([ends, ends[::-1]])), shape=shape).tocsr()
     faces, edges = (_incidence(part, len(points)) for part in (mesh.faces, mesh.edges))

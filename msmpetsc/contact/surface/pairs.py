@@ -26,8 +26,8 @@ from msmpetsc.geometry.surface import Surface
 # Positions whose contacts and candidates are kept: the base of a line search and its
 # trials
 REMEMBERED = 3
-# Edges that a point may move before a new broad phase; 0.25 has four times the pairs, and
-# fewer edges do not have fewer pairs
+# Edges that a point may move before a new broad phase; with fewer the pairs are not
+# fewer, and 0.25 has four times the pairs
 REACH = 0.02
 # Edges that a point may move in a narrow step
 FARTHEST = 0.05

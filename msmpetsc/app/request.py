@@ -102,11 +102,6 @@ class RunRequest:
         metavar="N",
         type=int,
     )
-    gather: bool = given(
-        False,
-        "let rank 0 write for all ranks, for cluster nodes without a shared file system",
-        action="store_true",
-    )
     true_error: int | None = given(
         None,
         "solve every N-th step to rounding as well and store its true error",

@@ -165,15 +165,15 @@ class Resumed:
             if was.get(key) != now.get(key):
                 yield f"{key}: {_shown(was.get(key))} in {earlier.path}, {_shown(now.get(key))} now"
 
-    def file(self, comm: MPI.Comm, attributes: dict[str, Any], gathers: bool) -> ResultFile:
+    def file(self, comm: MPI.Comm, attributes: dict[str, Any]) -> ResultFile:
         """Open the file for writing, in place or as a copy if the run has changed (collective)."""
         earlier = self.earlier
         if not (self.differs or self.force) and earlier.planned == self.stored:
-            return ResultFile(earlier.path, comm, attributes, Begin.IN_PLACE, gathers)
+            return ResultFile(earlier.path, comm, attributes, Begin.IN_PLACE)
         before = f"{earlier.texts.get('command', '')} (to step {earlier.step})"
         attributes["earlier"] = "\n".join(filter(None, [earlier.texts.get("earlier"), before]))
         attributes["scene_file"] = attributes["scene_file"] or earlier.texts["scene_file"]
-        return ResultFile(earlier.path, comm, attributes, Begin.COPY, gathers)
+        return ResultFile(earlier.path, comm, attributes, Begin.COPY)
 
     def refuse_other_lattice(self, comm: MPI.Comm, model: "Model") -> None:
         """Raise InputError if the lattice differs from the earlier run's lattice (collective)."""

@@ -245,9 +245,9 @@ def open_output(
     request = plan.request
     attributes = attributes_of(comm, plan.scene, request) | dict(more or {})
     if plan.resumed:
-        return plan.resumed.file(comm, attributes, request.gather)
+        return plan.resumed.file(comm, attributes)
     begin = Begin.OVERWRITE if request.overwrite else Begin.NEW
-    return ResultFile(request.path, comm, attributes, begin, request.gather)
+    return ResultFile(request.path, comm, attributes, begin)
 
 
 def described_model(comm: MPI.Intracomm, plan: RunPlan) -> Model:

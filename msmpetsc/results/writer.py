@@ -86,13 +86,11 @@ class ResultFile:
         comm: MPI.Comm,
         attributes: dict[str, Any],
         begin: Begin = Begin.NEW,
-        gathers: bool = False,
     ):
         """Open the file (collective).
 
         attributes : origin of the file; format and format_version are added
         begin      : whether the file is new, a copy, or written in place
-        gathers    : rank 0 writes the frames of all ranks, even if each rank can reach the file
 
         Raises InputError if the file cannot be written, exists, or is locked.
         """
@@ -101,7 +99,6 @@ class ResultFile:
         self._part = self.path.with_name(f"{self.path.name}.{os.getpid()}.part")
         self._comm = comm
         self._begin = begin
-        self._gathers = gathers
         # on rank 0 only, as is its storage
         self._file: h5py.File | None = None
         self._storage: Storage | None = None
@@ -213,7 +210,7 @@ class ResultFile:
                     for name, dataset in self._file["frames"].items()
                     if name in FRAME_FIELDS and name != "time" and not is_distributed(name)
                 }
-        if self._comm.size > 1 and not self._gathers:
+        if self._comm.size > 1:
             self._descriptor = open_on_all_ranks(self._comm, self.path)
 
     def append(self, frame: Frame) -> None:

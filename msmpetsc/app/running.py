@@ -149,7 +149,7 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> tuple[Checkpoints, Cost, S
             failure = error
         if systems and not checkpoints.signal:
             systems.sum_up()
-        file.close(trim=not checkpoints.signal)
+        file.close()
     return checkpoints, cost, failure
 
 

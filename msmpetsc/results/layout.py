@@ -89,9 +89,6 @@ class Layout:
                 yield Plan(
                     f"frames/{name}", (self.frames, *shape), (self.frames, *shape), about.dtype
                 )
-        # The checkpoint comes last and is never trimmed, so the end of the file never
-        # moves back. HDF5 would cut the file before it stores the new length, and a
-        # kill in between would leave a file that cannot be opened.
         yield Plan("checkpoint/step", (2,), (2,), FIELDS["checkpoint/step"].dtype)
         if self.numbers:
             count = len(self.numbers)
@@ -140,19 +137,13 @@ def _rows_plan(name: str, times: int, rows: int, shape: tuple[int, ...], dtype: 
 
 
 def _plan_dataset(file: h5py.File, plan: Plan) -> None:
-    """Create a dataset that can shrink, with all its space allocated and nothing written.
-
-    This calls h5py's low-level API: its create_dataset always fills a dataset that can be resized.
-    """
+    """Create a dataset with all its space allocated and nothing written."""
     dcpl = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     dcpl.set_chunk(plan.chunks)
     dcpl.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
     dcpl.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
     # without times the same run writes the same bytes
     dcpl.set_obj_track_times(False)
-    if plan.name == "frames/time":
-        # the value behind the new end of a dataset that has shrunk
-        dcpl.set_fill_value(np.array(np.nan))
     space = h5py.h5s.create_simple(plan.shape, plan.shape)
     kind = h5py.h5t.py_create(np.dtype(plan.dtype))
     h5py.h5d.create(file.id, plan.name.encode(), kind, space, dcpl)

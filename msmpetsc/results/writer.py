@@ -95,7 +95,7 @@ class ResultFile:
         Raises InputError if the file cannot be written, exists, or is locked.
         """
         self.path = Path(path)
-        self._planned = self.finished = 0
+        self.finished = 0
         self._part = self.path.with_name(f"{self.path.name}.{os.getpid()}.part")
         self._comm = comm
         self._begin = begin
@@ -112,8 +112,6 @@ class ResultFile:
         self._most_copied: int | None = None
         # number of rows of each rank, by the name of a distributed field
         self._rows: dict[str, list[int]] = {}
-        # whether a write has failed
-        self._failed = False
         # inodes of the files that do not outlast the run, by path
         self._temporary: dict[Path, int] = {}
         with self._together():
@@ -130,10 +128,9 @@ class ResultFile:
         if kind is None:
             self.close()
         else:
-            # Nothing collective is called, as other ranks may be elsewhere. After a
-            # failed write the disk may be full, and then metadata must not change.
+            # nothing collective is called, as other ranks may be elsewhere
             with suppress(InputError), plain_errors(self.path):
-                self._finish(trim=not self._failed)
+                self._finish()
             if not getattr(error, "on_all_ranks", False):
                 self.abandon()
 
@@ -196,7 +193,6 @@ class ResultFile:
             if self._file is not None:
                 self._lay_out(self._file, layout)
         self.finished = self._comm.bcast(self.finished)
-        self._planned = count
         if self._begin is Begin.COPY and saved is not None:
             self.write_checkpoint(saved)
         with self._together():
@@ -257,14 +253,10 @@ class ResultFile:
                 self._file["checkpoint/step"][slot] = saved.step
                 self._flush(self._file)
 
-    def close(self, trim: bool = True) -> None:
-        """Close the file (collective); a second call does nothing.
-
-        trim : cut the datasets to the finished frames; a run that is to be resumed in place needs
-               them at their planned length
-        """
+    def close(self) -> None:
+        """Close the file (collective); a second call does nothing."""
         with self._together():
-            self._finish(trim)
+            self._finish()
         self._temporary = {}
 
     # On rank 0 alone
@@ -343,33 +335,26 @@ class ResultFile:
                     dataset[index] = earlier.frames[name][index]
         self.finished = count
 
-    def _finish(self, trim: bool) -> None:
-        """Trim the frames if asked to, then close the file and release its lock."""
+    def _finish(self) -> None:
+        """Close the file and release its lock."""
         if self._descriptor is not None:
             os.close(self._descriptor)
         self._descriptor = None
         file = self._file
         self._file = None
         self._numbers = {}
-        if file is None:
-            return
-        with self._resources, file:
-            if trim and self.finished < self._planned:
-                for name in FRAME_FIELDS.keys() & file["frames"].keys():
-                    file["frames"][name].resize(self.finished, axis=0)
+        if file is not None:
+            with self._resources:
+                file.close()
 
     # On all ranks together
 
     @contextmanager
     def _together(self) -> Iterator[None]:
         """Raise an error of any rank on all ranks after the block (collective)."""
-        try:
-            reporting = self._storage.reporting_errors() if self._storage else nullcontext()
-            with together(self._comm), plain_errors(self.path), reporting:
-                yield
-        except InputError:
-            self._failed = True
-            raise
+        reporting = self._storage.reporting_errors() if self._storage else nullcontext()
+        with together(self._comm), plain_errors(self.path), reporting:
+            yield
 
     def _collect(
         self,

@@ -264,7 +264,6 @@ def test_frames_after_the_checkpoint_are_kept_as_they_are(whole: Path, tmp_path,
     with h5py.File(path) as file:
         assert max(file["checkpoint/step"]) == 0 and finished(file) == 8
         times = file["frames/wall_time"][:]
-    # the trimmed file is written anew
     assert status_of("run", "--resume", path) == 0
     assert_same(path, whole)
     with h5py.File(path) as file:

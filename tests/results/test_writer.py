@@ -113,8 +113,7 @@ def test_who_writes_does_not_show_in_the_file(tmp_path):
 
 
 def test_no_write_leaves_a_broken_file(tmp_path, monkeypatch):
-    """Every write of HDF5, the trimming's too, is replayed: the file after each opens and holds all
-    finished frames."""
+    """Every write of HDF5 is replayed: the file after each opens and holds all finished frames."""
     disk = Disk()
     path = tmp_path / "x.h5"
 
@@ -130,8 +129,6 @@ def test_no_write_leaves_a_broken_file(tmp_path, monkeypatch):
         file.write_checkpoint(saved(index))
     marks[len(disk.log)] = 12, 11
     file.close()
-    # the trimming wrote to the file
-    assert len(disk.log) > max(marks)
 
     for writes, image in disk.images(start=min(marks)):
         count, checkpoint = marks[max(mark for mark in marks if mark <= writes)]
@@ -153,7 +150,6 @@ def test_going_on_writes_nothing_but_numbers_in_their_places(tmp_path, monkeypat
         for index in range(3):
             file.append(frame(index))
             file.write_checkpoint(saved(index))
-        file.close(trim=False)
     before = path.read_bytes()
     io.BytesIO.write(disk, before)
     monkeypatch.setattr(writer, "open_to_write", disk.opened)
@@ -163,7 +159,7 @@ def test_going_on_writes_nothing_but_numbers_in_their_places(tmp_path, monkeypat
     for index in range(3, 6):
         file.append(frame(index))
         file.write_checkpoint(saved(index))
-    file.close(trim=False)
+    file.close()
     with h5py.File(io.BytesIO(before)) as laid:
         numbers = sorted(places(laid))
     # the file was neither cut nor extended
@@ -237,7 +233,7 @@ class Disk(io.BytesIO):
 
 
 @pytest.mark.parametrize("failure", [None, RuntimeError])
-def test_ended_early_it_is_trimmed(tmp_path, failure):
+def test_ended_early_it_has_its_finished_frames(tmp_path, failure):
     try:
         with ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
             file.start_frames(STEPS + 1, NODES, {"surface": POINTS})
@@ -248,7 +244,6 @@ def test_ended_early_it_is_trimmed(tmp_path, failure):
     except RuntimeError:
         assert failure
     with open_result(tmp_path / "x.h5") as file:
-        assert {len(file["frames"][name]) for name in FRAME_FIELDS.keys() & file["frames"]} == {4}
         assert finished(file) == 4
         assert_holds(file, 4)
 

@@ -2,8 +2,8 @@
 
 Results on the same lattice are compared in all fields. The error of a field is its largest
 difference at a frame, divided by the field's scale (scripts/docs/pages/how-to/compare.md). The
-scale is taken over both runs and all compared frames. Differences below the rounding of the coarser
-stored type are 0. Two NaN are equal, and so are two infinities of the same sign.
+scale is taken over both runs and all compared frames. Two NaN are equal, and so are two infinities
+of the same sign.
 
 Results on different lattices of the same mesh are compared in their surfaces, point by point.
 Both have the same points, so nothing is projected or interpolated. The weight of a point is a third
@@ -23,7 +23,7 @@ ENERGIES = ("kinetic", "elastic", "potential", "contact")
 COMPARED = ("position", "surface", *ENERGIES, "momentum")
 # strain of the body or a spring below which a difference is rounding [-]
 LEAST_STRAIN = 1e-6
-# distance within which two points at rest are the same, relative to a cell [-]
+# distance within which two points at rest are the same, relative to the longest side [-]
 SAME_POINT = 1e-6
 # difference within which two times are the same, relative to the frames' spacing [-]
 SAME_TIME = 1e-6
@@ -123,10 +123,6 @@ def _distances(a: Result, b: Result, name: str, pairs: Indices) -> Distances:
         rows[first] if name == "potential" else rest
         for rows, first in zip((a_rows, b_rows), pairs[0], strict=True)
     ]
-    digits = max(
-        float(np.finfo(rows.dtype).eps) if rows.dtype.kind == "f" else 0.0
-        for rows in (a_rows, b_rows)
-    )
     greatest = np.empty(len(pairs))
     worst = np.empty(len(pairs), int)
     size = 0.0
@@ -134,7 +130,7 @@ def _distances(a: Result, b: Result, name: str, pairs: Indices) -> Distances:
         a_values, b_values = (
             np.asarray(rows, float) for rows in (a_rows[a_frame], b_rows[b_frame])
         )
-        distance = _row_lengths(difference(a_values, b_values, digits))
+        distance = _row_lengths(difference(a_values, b_values))
         worst[number] = np.argmax(distance) if distance.size else 0
         greatest[number] = distance[worst[number]] if distance.size else 0.0
         for values, origin in zip((a_values, b_values), origins, strict=True):
@@ -143,15 +139,11 @@ def _distances(a: Result, b: Result, name: str, pairs: Indices) -> Distances:
     return greatest, worst, float(size)
 
 
-def difference(a: Array, b: Array, digits: float) -> Floats:
-    """Return |a - b| minus the rounding of values with relative precision ``digits``, at least 0.
-
-    The difference of two NaN is 0, of a NaN and a number inf.
-    """
-    with np.errstate(invalid="ignore", over="ignore"):
-        distance = np.abs(a - b) - digits * np.maximum(np.abs(a), np.abs(b))
-    distance = np.where((a == b) | (np.isnan(a) & np.isnan(b)), 0.0, distance)
-    return np.maximum(np.where(np.isnan(distance), np.inf, distance), 0.0)
+@np.errstate(invalid="ignore", over="ignore")
+def difference(a: Array, b: Array) -> Floats:
+    """Return |a - b|: 0 for two NaN, inf for a NaN and a number."""
+    distance = np.where((a == b) | (np.isnan(a) & np.isnan(b)), 0.0, np.abs(a - b))
+    return np.where(np.isnan(distance), np.inf, distance)
 
 
 def _row_lengths(rows: Array) -> Floats:
@@ -199,37 +191,22 @@ def rows_agree(a: Array, b: Array, tolerance: float) -> Mask:
 
 def refuse_different_lattices(a: Result, b: Result) -> None:
     """Raise DifferentLattices, with a reason, if two results are not on the same lattice."""
-
-    def refuse(reason: str) -> None:
+    if reason := first_mismatch(a.lattice.nodes[:], b.lattice.nodes[:], "node"):
         raise DifferentLattices(f"{a.path} and {b.path} are runs of different lattices: {reason}")
 
-    nodes, b_nodes = a.lattice.nodes[:], b.lattice.nodes[:]
-    sizes = cell_size(a, nodes), cell_size(b, b_nodes)
-    if len(nodes) != len(b_nodes):
-        refuse(
-            f"{len(nodes)} and {len(b_nodes)} nodes, cells of {sizes[0]:.4g} m and {sizes[1]:.4g} m"
-        )
-    if abs(sizes[0] - sizes[1]) > SAME_POINT * sizes[0]:
-        refuse(f"cells of {sizes[0]:.6g} m and {sizes[1]:.6g} m")
-    if mismatch := first_mismatch(nodes, b_nodes, SAME_POINT * (sizes[0] or 1.0)):
-        refuse(f"node {mismatch}")
 
-
-def first_mismatch(a: Positions, b: Positions, tolerance: float) -> str:
-    """Return in words the first of points (n, 3) [m] that differ by more than ``tolerance``."""
-    same = rows_agree(a, b, tolerance)
+def first_mismatch(a: Positions, b: Positions, kind: str) -> str:
+    """Return in words how points (n, 3) [m] at rest first differ; "" if they are the same."""
+    if len(a) != len(b):
+        return f"{len(a)} and {len(b)} {kind}s"
+    same = rows_agree(a, b, SAME_POINT * longest_side(a, np.zeros(len(a))))
     if same.all():
         return ""
     first = int(np.argmin(same))
-    return f"{first} rests at {point_text(a[first])} in one, at {point_text(b[first])} in the other"
-
-
-def cell_size(run: Result, nodes: Positions) -> float:
-    """Return the edge length [m] of the first cell; 0 if the file has no cells."""
-    if "cells" not in run.lattice or not len(run.lattice.cells):
-        return 0.0
-    corners = run.indices("lattice/cells")[0]
-    return float(np.ptp(nodes[corners], axis=0).max())
+    return (
+        f"{kind} {first} rests at {point_text(a[first])} in one, "
+        f"at {point_text(b[first])} in the other"
+    )
 
 
 def point_text(point: Floats) -> str:
@@ -304,13 +281,8 @@ def refuse_different_meshes(a: Result, b: Result) -> None:
         if missing is not None:
             raise InputError(f"{run.path} has no {missing}: it was run with output.surface = false")
 
-    def refuse(reason: str) -> None:
-        raise InputError(f"{a.path} and {b.path} are runs of different meshes: {reason}")
-
-    points, b_points = a["surface/points"][:], b["surface/points"][:]
-    if len(points) != len(b_points) or not len(points):
-        refuse(f"{len(points)} and {len(b_points)} surface points")
-    if mismatch := first_mismatch(points, b_points, SAME_POINT * np.ptp(points, axis=0).max()):
-        refuse(f"point {mismatch}")
+    reason = first_mismatch(a["surface/points"][:], b["surface/points"][:], "surface point")
     if not np.array_equal(a["surface/triangles"][:], b["surface/triangles"][:]):
-        refuse("their triangles join other points")
+        reason = reason or "their triangles join other points"
+    if reason:
+        raise InputError(f"{a.path} and {b.path} are runs of different meshes: {reason}")

@@ -8,39 +8,30 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from errno import EACCES, EAGAIN
-from itertools import count
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from msmpetsc.errors import InputError, one_line
 
-# numbers of temporary files [-]; threads may write the same file, and USD remembers the
-# name of a failed file
-PART_NUMBERS = count()
-# letters of a name kept in its temporary name [-]; file systems limit its length
-LONGEST_STEM = 50
-
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary path to write to; rename it to ``path`` when the file is complete.
+    """Yield a path in a temporary folder; move the file to ``path`` when it is complete.
 
-    The temporary name has the same ending, because many writers choose the format by it. Links are
-    followed. A replaced file keeps its permissions, and a file that may not be written stays. All
-    output files are written this way, except results, which grow (results.writer).
+    Links are followed. A replaced file keeps its permissions, and a file that may not be written
+    stays. All output files are written this way, except results, which grow (results.writer).
 
     Raises InputError, with the path and the system's reason in a single line.
     """
     real = Path(os.path.realpath(path))
-    part = real.with_name(
-        f".{real.stem[:LONGEST_STEM]}.{os.getpid()}-{next(PART_NUMBERS)}.part{real.suffix}"
-    )
-    try:
-        with plain_errors(path):
-            refuse_no_file(path)
-            real.parent.mkdir(parents=True, exist_ok=True)
-            if real.exists():
-                open(real, "r+b").close()
+    with plain_errors(path):
+        refuse_no_file(path)
+        real.parent.mkdir(parents=True, exist_ok=True)
+        if real.exists():
+            open(real, "r+b").close()
+        with TemporaryDirectory(prefix=".part-", dir=real.parent) as folder:
+            part = Path(folder, real.name)
             yield part
             with open(part, "r+b") as file:
                 # some file systems report only here that they are full
@@ -48,10 +39,6 @@ def whole_file(path: Path) -> Iterator[Path]:
             if real.exists():
                 shutil.copymode(real, part)
             part.replace(real)
-    finally:
-        # the folder may not exist
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
 
 
 def write_whole(path: Path, content: str | bytes) -> None:

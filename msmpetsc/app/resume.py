@@ -202,8 +202,7 @@ class Resumed:
             kept = simulation.stored_until(saved.step)
             if kept > self.earlier.finished:
                 raise InputError(f"{path} is damaged: it lacks frames from before its checkpoint")
-            is_frame = (kept - 1) * simulation.every == saved.step
-            on_root(comm, lambda: refuse_unlike_frame(path, kept - 1, is_frame))
+            on_root(comm, lambda: refuse_unlike_frame(path, kept - 1))
         # later frames are of the unchanged scene
         if self.differs:
             file.keep(kept)

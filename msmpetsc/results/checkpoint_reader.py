@@ -22,9 +22,7 @@ from msmpetsc.results.reader import Result
 from msmpetsc.results.untrusted_file import as_python, plain_damage
 from msmpetsc.scene.reading import scene_of
 
-# median distance of a checkpoint from its frame, in longest sides [-]; most stay near
-NEAR = 0.01
-# largest distance from any other frame, in longest sides [-]; excludes damaged numbers
+# largest distance of a checkpoint from a frame, in longest sides [-]; excludes damaged numbers
 FARTHEST = 1e6
 # difference of equal lattices relative to the largest value [-]; the order of sums over
 # cells depends on the number of ranks
@@ -82,18 +80,12 @@ def _newest_checkpoint(run: Result) -> tuple[int, Checkpoint, list[str]] | None:
     slot = newest_slot(steps)
     if slot is None:
         return None
-    names: list[str] = []
-    values = np.empty(0)
+    numbers: dict[str, float] = {}
     if "numbers" in stored:
-        values = run["checkpoint/numbers"][slot]
+        values = run["checkpoint/numbers"][slot].tolist()
         with plain_damage(run.path):
-            names = str(as_python(run.file["checkpoint/numbers"].attrs.get("names", ""))).split()
-    if len(names) != len(values):
-        raise InputError(
-            f"{run.path} is damaged: checkpoint/numbers has {len(values)} numbers of "
-            f"{len(names)} names"
-        )
-    numbers = dict(zip(names, values.tolist(), strict=True))
+            names = str(as_python(run.file["checkpoint/numbers"].attrs.get("names", "")))
+            numbers = dict(zip(names.split(), values, strict=True))
     rows = [name for name in stored if name not in ("step", "numbers")]
     return slot, Checkpoint(int(steps[slot]), numbers=numbers), rows
 
@@ -126,33 +118,18 @@ def read_checkpoint(comm: MPI.Comm, path: Path, owned: int) -> Checkpoint | None
         )
 
 
-def refuse_unlike_frame(path: Path, number: int, is_frame: bool) -> None:
-    """Raise InputError if the newest checkpoint's positions cannot follow from a frame.
-
-    number   : number of the last frame up to the checkpoint's step
-    is_frame : whether the frame shows that very step
-
-    The positions may differ: contact may have reflected nodes, or the run was resumed on another
-    number of ranks. But in a step a body moves less than its own length, and most nodes stay near
-    their positions in the frame.
-    """
+def refuse_unlike_frame(path: Path, number: int) -> None:
+    """Raise InputError if the newest checkpoint's positions cannot follow from a frame."""
     with Result(path) as run:
         slot = newest_slot(run["checkpoint/step"][:])
-        q, q_previous = (run[f"checkpoint/{name}"][slot] for name in ("q", "q_previous"))
         frame = run.frames.position[number]
-        motion = np.abs(frame - run.frames.position[number - 1]).max() if number else 0.0
         size = np.ptp(run.lattice.nodes[:], axis=0).max()
-    distance, step = (np.abs(a - b).max(axis=1) for a, b in ((q, frame), (q, q_previous)))
-    largest = size + motion if is_frame else FARTHEST * size
-    median = NEAR * size + motion if is_frame else FARTHEST * size
-    # without an earlier frame the body's speed is unknown
-    in_step = largest if number else FARTHEST * size
-    is_near = distance.max() <= largest and np.median(distance) <= median
-    if not (is_near and step.max() <= in_step):
-        raise InputError(
-            f"{path} is damaged: its checkpoint's positions are {distance.max():.3g} m from the "
-            f"positions of frame {number}, and moved by {step.max():.3g} m in a step"
-        )
+        for name in ("q", "q_previous"):
+            distance = np.abs(run[f"checkpoint/{name}"][slot] - frame).max()
+            if not distance <= FARTHEST * size:
+                raise InputError(
+                    f"{path} is damaged: checkpoint/{name} is {distance:.3g} m from frame {number}"
+                )
 
 
 def end_of_run(comm: MPI.Comm, folder: Path, name: str, lattice: Lattice) -> InitialState:

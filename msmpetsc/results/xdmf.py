@@ -15,9 +15,6 @@ from msmpetsc.results.reader import Result
 NUMBER_TYPES = {"f": "Float", "i": "Int", "u": "UInt"}
 # share of a run's time for updates of the XDMF file [-]; hardly slows the run
 SHARE = 0.05
-# Length of the difference of two vectors, given as pairs of components x, y, z. VTK's
-# functions know no other name of the root, and no exponents in numbers.
-LENGTH = "sqrt(($0 - $1) * ($0 - $1) + ($2 - $3) * ($2 - $3) + ($4 - $5) * ($4 - $5))"
 HEAD = '<?xml version="1.0" encoding="utf-8"?>\n<Xdmf Version="3.0"><Domain>'
 
 
@@ -40,7 +37,7 @@ def write_xdmf(h5_path: str | Path) -> Path:
     """Write x.xdmf beside x.h5 for its finished frames, and return its path. Raises InputError.
 
     The file has two temporal collections: the surface triangles, if the surface was stored, and the
-    lattice cells, with any stored stress. Both have displacement, velocity and speed.
+    lattice cells, with any stored stress. Both have displacement and velocity.
     """
     h5_path = Path(h5_path)
     with Result(h5_path) as run:
@@ -93,14 +90,12 @@ def _motion(run: Result, points: str, index: int, times: Floats) -> Iterator[str
     moved = _function("$0 - $1", f"{rows} 3", [_slab(run, points, index), at_rest])
     before, after = max(index - 1, 0), min(index + 1, len(times) - 1)
     passed = float(times[after] - times[before])
+    # VTK's functions know no exponents in numbers
     rate = np.format_float_positional(1 / passed if passed else 0.0, trim="0")
     ends = [_slab(run, points, end) for end in (after, before)]
-    columns = [_slab(run, points, end, axis, 1) for axis in range(3) for end in (after, before)]
     velocity = _function(f"($0 - $1) * {rate}", f"{rows} 3", ends)
-    speed = _function(f"{LENGTH} * {rate}", f"{rows} 1", columns)
     yield _attribute("displacement", "Vector", "Node", moved)
     yield _attribute("velocity", "Vector", "Node", velocity)
-    yield _attribute("speed", "Scalar", "Node", speed)
 
 
 def _stress(run: Result, index: int) -> Iterator[str]:
@@ -114,7 +109,7 @@ def _stress(run: Result, index: int) -> Iterator[str]:
             for part, first in (("normal", 0), ("shear", 3)):
                 yield _attribute(f"{name}_{part}", "Vector", centre, _slab(run, name, index, first))
         else:
-            yield _attribute(name, "Scalar", centre, _slab(run, name, index, 0, 0))
+            yield _attribute(name, "Scalar", centre, _slab(run, name, index))
 
 
 def _attribute(name: str, sort: str, centre: str, item: str) -> str:
@@ -128,19 +123,19 @@ def _function(formula: str, size: str, arguments: list[str]) -> str:
     return "".join([head, *arguments, "</DataItem>"])
 
 
-def _slab(run: Result, name: str, index: int, first: int = 0, columns: int = 3) -> str:
-    """Return a reference to columns of a frame of a field: start, stride, count and dataset.
+def _slab(run: Result, name: str, index: int, first: int = 0) -> str:
+    """Return a reference to a frame of a field: start, stride, count and dataset.
 
-    first, columns : first column and number of columns; 0 columns for a field (T, r)
+    first : first of the three columns, of a field of vectors or tensors
 
     VTK uses the comment as the name of the slab, by which it caches.
     """
-    more = columns > 0
-    size = f"{run.frames[name].shape[1]}" + f" {columns}" * more
+    more = run.frames[name].ndim == 3
+    size = f"{run.frames[name].shape[1]}" + " 3" * more
     select = f"{index} 0{f' {first}' * more} 1 1{' 1' * more} 1 {size}"
     return (
         f'<DataItem ItemType="HyperSlab" Dimensions="{size}" Type="HyperSlab">'
-        f"<!-- {index}, {first} {columns} of {name} -->"
+        f"<!-- {index}, {first} of {name} -->"
         f'<DataItem Dimensions="3 {2 + more}" Format="XML">{select}</DataItem>'
         f"{_data(run, f'frames/{name}')}</DataItem>"
     )

@@ -38,7 +38,7 @@ def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) 
 # a legend's line height, gap between entries, and type size [px]
 LINE, GAP, TYPE_SIZE = 34, 36, 15
 # width of the symbol in front of an entry's text [px]
-WIDTHS = {"bar": 220, "swatch": 22, "glass": 22, "arrow": 30, "note": 0}
+WIDTHS = {"bar": 220, "swatch": 22, "glass": 22, "arrow": 30}
 # first and last row of a bar and of a tick, middle and size of a tick's number [px]
 BAR, TICK, NUMBER = (5, 17), (14, 20), (27, 12)
 # factor by which a legend is drawn larger and then reduced, for smooth edges
@@ -49,7 +49,7 @@ SUPERSAMPLING = 3
 class Entry:
     """A legend entry: a symbol and a text.
 
-    kind  : "bar" of colours, "swatch", "glass", "arrow", or "note" for a text alone
+    kind  : "bar" of colours, "swatch", "glass" or "arrow"
     ticks : position in [0, 1] and number of each tick of a bar
     """
 
@@ -84,8 +84,6 @@ def entries_of(composition: Composition, stills: Sequence[Still]) -> list[Entry]
         entries.append(Entry("arrow", "force", ARROW))
     if entries and any(len(still.overlays.obstacles) for still in stills):
         entries.append(Entry("glass", "obstacle", GLASS))
-    if composition.note:
-        entries.append(Entry("note", composition.note))
     return entries
 
 

@@ -6,11 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import pyvista as pv
 
-from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions
-from msmpetsc.comm import log
+from msmpetsc.backend.arrays import Floats, Positions
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.prepare import part_labels
-from msmpetsc.geometry.surface import Surface
 from msmpetsc.results.progress_bar import counted
 from msmpetsc.view.camera import Camera, camera_facing
 from msmpetsc.view.colours import Colouring, colouring_of, scaled
@@ -52,24 +49,20 @@ class Still:
 class Composition:
     """The frames of a subject to be drawn, with their common camera, colours and extent.
 
-    extremes  : outermost points (e, 3) in view of all frames, in a set of directions [m]
-    bounds    : corners (2, 3) of the box around all frames, including parts out of view [m]
+    extremes  : outermost points (e, 3) of all frames, in a set of directions [m]
     colouring : field with its scale
-    note      : text about parts that leave the view; "" if none do
     """
 
     subject: Drawable
     style: Style
     extremes: Positions
-    bounds: Positions
     camera: Camera
     colouring: Colouring
-    note: str = ""
 
     @property
     def box(self) -> Positions:
-        """Corners (2, 3) of the box around everything that stays in view [m]."""
-        return around(self.extremes)
+        """Corners (2, 3) of the box around all frames [m]."""
+        return np.array([self.extremes.min(axis=0), self.extremes.max(axis=0)])
 
     def stills(self, frames: Sequence[int], words: str = "") -> list[Still]:
         """Return the still of each frame, with its time and ``words`` as caption."""
@@ -105,62 +98,19 @@ class Composition:
 def composition_of(subject: Drawable, frames: Sequence[int], style: Style) -> Composition:
     """Return the composition of frames, which are read in turn. Raises InputError."""
     colouring = colouring_of(subject, style.colour)
-    # a part's outermost points in these directions represent its extent
+    # the outermost points in these directions represent the extent
     directions = np.concatenate([np.eye(3), -np.eye(3), pv.Icosphere(nsub=1).points]).T
-    parts = parts_of(subject)
-    extremes: list[list[Positions]] = []
+    extremes: list[Positions] = []
     distinct = sorted(set(frames))
     for index in counted(distinct, "frames read"):
         points = subject.surface(index)
         if not (np.abs(points) < FARTHEST).all():
             raise InputError(f"{subject.name}: frame {index} has points that cannot be drawn")
-        of_parts = (points[own] for own in parts)
-        extremes.append([own[np.unique((own @ directions).argmax(axis=0))] for own in of_parts])
-    boxes = np.array([[around(own) for own in of_frame] for of_frame in extremes])
-    bounds = around(boxes.reshape(-1, 3))
-    if np.ptp(bounds, axis=0).max() == 0:
+        extremes.append(points[np.unique((points @ directions).argmax(axis=0))])
+    shown = np.concatenate(extremes)
+    if np.ptp(shown, axis=0).max() == 0:
         raise InputError(f"{subject.name}: the surface at these frames has no extent")
-    stays = staying(boxes)
-    note = "" if stays.all() else f"{(~stays).sum()} of {len(parts)} parts leave the picture"
-    if note:
-        log.info("%s: %s", subject.name, note)
-    kept = (own for of_frame in extremes for own, stay in zip(of_frame, stays, strict=True) if stay)
-    shown = np.concatenate([*extremes[0], *kept])
     gravity = subject.scene.gravity
     pull = gravity.acceleration if gravity else None
     camera = camera_facing(shown, pull, style.eye or subject.scene.picture.eye)
-    return Composition(
-        subject, style, shown, bounds, camera, scaled(colouring, subject, distinct), note
-    )
-
-
-def around(points: Positions) -> Positions:
-    """Return the corners (2, 3) of the box around points (n, 3)."""
-    return np.array([points.min(axis=0), points.max(axis=0)])
-
-
-def parts_of(subject: Drawable) -> list[Indices]:
-    """Return the numbers of the surface points of each connected part of each body."""
-    rest = subject.rest
-    triangles = subject.triangles
-    labels = part_labels(Surface(rest.points, triangles)) * (rest.body_of_point.max() + 1)
-    labels += rest.body_of_point[triangles[:, 0]]
-    return [np.unique(triangles[labels == label]) for label in np.unique(labels)]
-
-
-def staying(boxes: Positions) -> Mask:
-    """Return which parts (p,) stay in view.
-
-    The half of the parts that moves least out of the initial box stays. Another part leaves if it
-    moves farther from the box around this half than the longest side of that box.
-
-    boxes : corners (T, p, 2, 3) of the box around each part at each frame [m]
-    """
-    begin = around(boxes[0].reshape(-1, 3))
-    excess = np.maximum(begin[0] - boxes[:, :, 0], boxes[:, :, 1] - begin[1]).max(axis=(0, 2))
-    nearest = np.argsort(excess, kind="stable")[: max(1, len(excess) // 2)]
-    home = around(np.concatenate([begin, boxes[:, nearest].reshape(-1, 3)]))
-    limit = np.ptp(home, axis=0).max()
-    return np.asarray(
-        ((boxes[:, :, 0] >= home[0] - limit) & (boxes[:, :, 1] <= home[1] + limit)).all(axis=(0, 2))
-    )
+    return Composition(subject, style, shown, camera, scaled(colouring, subject, distinct))

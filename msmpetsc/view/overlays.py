@@ -95,9 +95,7 @@ def overlays_at(subject: Drawable, index: int, bodies: Positions, camera: Camera
     """
     time = float(subject.times[index])
     solids = subject.solids
-    shown = Overlays(
-        arrows=[arrow for arrow in _arrows(subject, index) if _is_near(arrow[[0, 0]], bodies)]
-    )
+    shown = Overlays(arrows=_arrows(subject, index))
     for number, obstacle in enumerate(subject.scene.obstacle):
         if not within(time, obstacle.start, obstacle.stop):
             continue

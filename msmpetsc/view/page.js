@@ -5,9 +5,8 @@ const data = JSON.parse(document.getElementById("data").textContent);
 const byId = (id) => document.getElementById(id);
 const canvas = byId("view"), slider = byId("slider"), play = byId("play"), speedChoice = byId("speed");
 const frames = data.times.length, points = data.points;
-const box = data.box || [[0, 0, 0], [1, 1, 1]], size = box[1].map((high, k) => Math.max(high - box[0][k], 1e-30));
-const seen = data.view || box, middle = seen[0].map((low, k) => (low + seen[1][k]) / 2);
-const reach = Math.max(...seen[1].map((high, k) => high - seen[0][k]), 1e-30);
+const box = data.box, size = box[1].map((high, k) => Math.max(high - box[0][k], 1e-30));
+const middle = box[0].map((low, k) => (low + box[1][k]) / 2), reach = Math.max(...size);
 const view = { frame: 0, yaw: 0, pitch: 0, zoom: 1, right: 0, up: 0, playing: false };
 const dark = matchMedia("(prefers-color-scheme: dark)");
 

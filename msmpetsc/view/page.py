@@ -74,7 +74,7 @@ def packed_frames(composition: Composition, frames: Sequence[int]) -> dict[str, 
     subject = composition.subject
     bits = "<u2" if len(subject.rest.points) <= LEVELS else "<u4"
     return {
-        "positions": deflated(changes(quantised(subject.surface, frames, composition.bounds))),
+        "positions": deflated(changes(quantised(subject.surface, frames, composition.box))),
         "colours": deflated(changes(map(composition.colouring.numbers, frames))),
         "triangles": zlib.compress(subject.triangles.astype(bits).tobytes(), 6),
     }
@@ -110,8 +110,7 @@ def page_facts(composition: Composition, stills: Sequence[Still]) -> dict[str, A
     return {
         "title": subject.title,
         "points": len(subject.rest.points),
-        "box": composition.bounds,
-        "view": composition.box,
+        "box": composition.box,
         "times": subject.times[frames],
         "speed": usual_speed(float(np.ptp(subject.times[[frames[0], frames[-1]]]))),
         "camera": asdict(composition.camera),

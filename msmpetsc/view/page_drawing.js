@@ -249,7 +249,7 @@ function drawArrow(camera, [tail, tip], eye) { // flat, as wide seen from every 
   drawFlat(camera, [at(0.64, 0.13), at(0.64, -0.13), tip], gl.TRIANGLES, [...colour("#cf5a3c"), 1]);
 }
 
-const CORNERS = [0, 1, 2, 3, 4, 5, 6, 7].map((n) => [n >> 2 & 1, n >> 1 & 1, n & 1].map((bit, k) => seen[bit][k]));
+const CORNERS = [0, 1, 2, 3, 4, 5, 6, 7].map((n) => [n >> 2 & 1, n >> 1 & 1, n & 1].map((bit, k) => box[bit][k]));
 
 function draw() {
   const density = Math.min(window.devicePixelRatio || 1, 2);

@@ -4,7 +4,6 @@ No picture is compared as an image.
 """
 
 import os
-from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -13,7 +12,6 @@ import trimesh
 from ball_result import BARE, EAST_HELD, HEIGHTS, write_ball
 from conftest import ROOT, python
 from PIL import Image, ImageDraw
-from surface_alone import drawable_of
 
 from msmpetsc.errors import InputError
 from msmpetsc.results.reader import Result
@@ -21,9 +19,9 @@ from msmpetsc.scene.body import Region
 from msmpetsc.scene.motion import Pin
 from msmpetsc.scene.schema import OfBody
 from msmpetsc.view import renderer, sheet
-from msmpetsc.view.annotations import Entry, entries_of, legend_picture
+from msmpetsc.view.annotations import Entry, legend_picture
 from msmpetsc.view.camera import YAW, camera_facing
-from msmpetsc.view.composition import Still, Style, composition_of, staying
+from msmpetsc.view.composition import Still, Style, composition_of
 from msmpetsc.view.drawable import BodiesAtRest, drawable_of_result
 
 
@@ -333,47 +331,6 @@ def test_a_black_picture_is_no_picture(falling_ball, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="black picture"):
         sheet.contact_sheet(falling_ball, tmp_path / "y.png", frames=[0])
     assert not (tmp_path / "y.png").exists()
-
-
-def test_a_part_that_flies_off_does_not_shrink_the_others(tmp_path, caplog):
-    """Two balls of 0.2 m, of which the second goes 100 m; the first falls by 0.1 m."""
-    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
-    count = len(ball.vertices)
-    start = np.concatenate([ball.vertices, ball.vertices + np.array([0.4, 0, 0])])
-    away = np.repeat([[0, 0, -0.01], [10.0, 0, 5.0]], count, axis=0)
-    subject = drawable_of(start, np.concatenate([ball.faces, ball.faces + count]))
-    flying = replace(subject, times=np.arange(11) / 10, nodes=lambda index: start + index * away)
-    with caplog.at_level("INFO", logger="msmpetsc"):
-        composition = composition_of(flying, list(range(11)), Style())
-    assert "1 of 2 parts leave the picture" in caplog.text
-    assert [entry.text for entry in entries_of(composition, composition.stills([0]))] == [
-        composition.note
-    ]
-    sheet.draw_panels(composition, composition.stills([0, 10]), tmp_path / "x.png")
-    first, last = np.split(np.array(Image.open(tmp_path / "x.png")), 2, axis=1)
-    # the resting ball; both are 0.6 m wide at first, and 4 px if 100 m were seen
-    for panel in (
-        first,
-        last,
-    ):
-        assert np.ptp(np.flatnonzero(is_body(panel[:-100, : len(panel[0]) // 2]).any(axis=0))) > 100
-    assert is_body(first[:-100, len(first[0]) // 2 :]).any(), "where both begin is in view"
-    assert composition.bounds[1, 0] == pytest.approx(100.5) and composition.box[
-        1, 0
-    ] == pytest.approx(0.5)
-
-
-@pytest.mark.parametrize("way", [0.0, 0.5, 30.0])
-def test_the_only_part_and_all_parts_that_go_together_stay_in_view(way):
-    boxes = np.array([[[[0, 0, 0], [1, 1, 1]]]], float)
-    falls = boxes + np.arange(5).reshape(-1, 1, 1, 1) * way
-    assert staying(falls).tolist() == [True]
-    assert staying(np.concatenate([falls, falls + np.array([0, 2, 0])], axis=1)).tolist() == [
-        True,
-        True,
-    ]
-    flies = np.concatenate([np.repeat(boxes, 5, axis=0), falls + np.array([2, 0, 0])], axis=1)
-    assert staying(flies).tolist() == [True, way < 1]
 
 
 @pytest.mark.parametrize("width", [240, 400, 900])

@@ -30,8 +30,8 @@ from msmpetsc.view.film import usual_speed
 from msmpetsc.view.mesh import drawn
 from msmpetsc.view.overlays import Overlays
 
-# size of a page [byte] above which frames are left out
-MAX_BYTES = 20e6
+# size of positions and colours before they are packed [byte], above which frames are left out
+MAX_BYTES = 30_000_000
 # largest 16-bit integer
 LEVELS = 65535
 PARTS = files("msmpetsc.view")
@@ -39,27 +39,17 @@ SCRIPTS = ("page.js", "page_drawing.js", "page_steering.js")
 
 
 def write_page(subject: Drawable, path: Path, frames: Sequence[int], style: Style) -> None:
-    """Write a page of these frames, or of a subset if the page would exceed ``MAX_BYTES``.
+    """Write a page of these frames, or of a subset if they would exceed ``MAX_BYTES``.
 
     Raises InputError if the frames cannot be drawn or the page cannot be written.
     """
-    composition = composition_of(drawn(subject), frames, style)
-    chosen = list(frames)
-    while True:
-        streams = packed_frames(composition, chosen)
-        size = sum(map(len, streams.values())) * 4 / 3
-        if size <= MAX_BYTES or len(chosen) < 3:
-            break
-        step = max(2, int(np.ceil(size / MAX_BYTES)))
-        chosen = [*chosen[:-1:step], chosen[-1]]
-    if len(chosen) < len(frames):
-        log.info(
-            "%s has %d of the %d frames: all would be above %.0f MB",
-            path,
-            len(chosen),
-            len(frames),
-            MAX_BYTES / 1e6,
-        )
+    subject = drawn(subject)
+    step = -(-7 * len(subject.rest.points) * len(frames) // MAX_BYTES)
+    chosen = [*frames[:-1:step], frames[-1]]
+    if step > 1:
+        log.info("%s has %d of the %d frames", path, len(chosen), len(frames))
+    composition = composition_of(subject, chosen, style)
+    streams = packed_frames(composition, chosen)
     # distinct fields of the fixed shares, in 8 bits
     states: dict[bytes, int] = {}
     fixed = (np.rint(255 * composition.subject.fixed(index)).astype(np.uint8) for index in chosen)

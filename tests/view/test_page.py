@@ -99,8 +99,8 @@ def test_colours_come_out_as_shares_of_the_scale(tmp_path):
 
 
 def test_a_page_too_large_has_fewer_frames_and_says_so(tmp_path, monkeypatch, caplog):
-    whole = sum(len(text) for text in data_of(written_page(tmp_path))["streams"].values())
-    monkeypatch.setattr(page, "MAX_BYTES", 0.9 * whole)
+    points = data_of(written_page(tmp_path))["points"]
+    monkeypatch.setattr(page, "MAX_BYTES", 7 * 10 * points)
     with caplog.at_level(logging.INFO, logger="msmpetsc"):
         data = data_of(written_page(tmp_path))
     assert data["times"][0] == 0 and data["times"][-1] == 1 and 2 < len(data["times"]) < 11

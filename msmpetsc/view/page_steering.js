@@ -1,4 +1,4 @@
-// Around the picture: legend, player, time, mouse, fingers, keys, and the address, which is a link to a view.
+// Around the picture: legend, player, time, mouse, fingers and keys.
 
 // What stands around the picture
 
@@ -71,38 +71,13 @@ function setPlaying(playing) {
   view.playing = playing && frames > 1;
   begun = null;
   if (view.playing) requestAnimationFrame(tick);
-  noteAddress();
   redraw();
 }
 
 function goTo(frame) {
   view.frame = Math.min(frames - 1, Math.max(0, Math.round(frame) || 0));
   begun = null;
-  noteAddress();
   redraw();
-}
-
-// The address: #frame=40&turn=30,10&zoom=2&move=0.1,0 is a view, and a link to it
-
-function readAddress() {
-  const given = new URLSearchParams(location.hash.slice(1));
-  const pair = (name) => (given.get(name) || "").split(",").map((part) => +part || 0);
-  [view.yaw, view.pitch = 0] = pair("turn");
-  [view.right, view.up = 0] = pair("move");
-  view.zoom = Math.min(50, Math.max(0.2, +given.get("zoom") || 1));
-  const frame = given.has("frame") ? +given.get("frame") : 0;
-  view.frame = Math.min(frames - 1, Math.max(0, Math.round(frame) || 0));
-  view.playing = given.get("play") === "1" && frames > 1;
-  begun = null;
-}
-
-function noteAddress() {
-  const round = (x) => +x.toPrecision(4);
-  const parts = [`frame=${view.frame}`, `turn=${round(view.yaw)},${round(view.pitch)}`];
-  if (view.zoom !== 1) parts.push(`zoom=${round(view.zoom)}`);
-  if (view.right || view.up) parts.push(`move=${round(view.right)},${round(view.up)}`);
-  if (view.playing) parts.push("play=1");
-  try { history.replaceState(null, "", `#${parts.join("&")}`); } catch { /* a browser may forbid it to files */ }
 }
 
 // Mouse, fingers, keys
@@ -125,8 +100,6 @@ function nearer(factor) {
   view.zoom = Math.min(50, Math.max(0.2, view.zoom * factor));
 }
 
-function changed() { noteAddress(); redraw(); }
-
 canvas.addEventListener("pointerdown", (event) => {
   canvas.setPointerCapture(event.pointerId);
   fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
@@ -139,14 +112,14 @@ canvas.addEventListener("pointermove", (event) => {
   if (fingers.size === 2) { nearer(apart() / before); shift(dx / 2, dy / 2); }
   else if (event.shiftKey || event.buttons === 2) shift(dx, dy);
   else turn(dx, dy);
-  changed();
+  redraw();
 });
 for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (event) => fingers.delete(event.pointerId));
 canvas.addEventListener("contextmenu", (event) => event.preventDefault());
 canvas.addEventListener("wheel", (event) => {
   event.preventDefault();
   nearer(Math.exp(-0.001 * event.deltaY * (event.deltaMode ? 30 : 1)));
-  changed();
+  redraw();
 }, { passive: false });
 slider.addEventListener("input", () => { view.playing = false; goTo(+slider.value); });
 play.addEventListener("click", () => setPlaying(!view.playing));
@@ -157,11 +130,11 @@ const KEYS = {
   ArrowLeft: () => { view.playing = false; goTo(view.frame - 1); },
   Home: () => goTo(0),
   End: () => goTo(frames - 1),
-  "+": () => { nearer(1.2); changed(); },
-  "-": () => { nearer(1 / 1.2); changed(); },
-  ArrowUp: () => { turn(0, 12); changed(); },
-  ArrowDown: () => { turn(0, -12); changed(); },
-  r: () => { Object.assign(view, { yaw: 0, pitch: 0, zoom: 1, right: 0, up: 0 }); changed(); },
+  "+": () => { nearer(1.2); redraw(); },
+  "-": () => { nearer(1 / 1.2); redraw(); },
+  ArrowUp: () => { turn(0, 12); redraw(); },
+  ArrowDown: () => { turn(0, -12); redraw(); },
+  r: () => { Object.assign(view, { yaw: 0, pitch: 0, zoom: 1, right: 0, up: 0 }); redraw(); },
 };
 addEventListener("keydown", (event) => {
   const act = KEYS[event.key.length === 1 ? event.key.toLowerCase() : event.key];
@@ -170,7 +143,6 @@ addEventListener("keydown", (event) => {
   act();
 });
 addEventListener("resize", redraw);
-addEventListener("hashchange", () => { readAddress(); if (view.playing) setPlaying(true); redraw(); });
 dark.addEventListener("change", redraw);
 
 // The start of the page, when all of it is known.
@@ -186,9 +158,7 @@ async function begin() {
   start();
   makeLegend();
   makePlayer();
-  readAddress();
   draw();
-  if (view.playing) setPlaying(true);
   document.documentElement.dataset.ready = "1";
 }
 begin().catch((error) => {

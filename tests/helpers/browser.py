@@ -32,8 +32,8 @@ PATIENCE = 30.0
 class Browser:
     """A page in a browser of its own; a context, which ends the browser."""
 
-    def __init__(self, page: Path, size: tuple[int, int] = (600, 700), address: str = ""):
-        """Open a page at an address ("frame=3") in a window of so many pixels."""
+    def __init__(self, page: Path, size: tuple[int, int] = (600, 700)):
+        """Open a page in a window of so many pixels."""
         # pipes from the browser and to the browser
         ours, theirs = os.pipe(), os.pipe()
         read, write = (fcntl.fcntl(fd, fcntl.F_DUPFD, 20) for fd in (theirs[0], ours[1]))
@@ -62,7 +62,7 @@ class Browser:
         )
         window: dict[str, Any] = {"newWindow": True, "width": size[0], "height": size[1]}
         try:
-            target = self._ask("Target.createTarget", url=f"{page.as_uri()}#{address}", **window)
+            target = self._ask("Target.createTarget", url=page.as_uri(), **window)
             self._session = self._ask(
                 "Target.attachToTarget", targetId=target["targetId"], flatten=True
             )["sessionId"]

@@ -28,9 +28,8 @@ from msmpetsc.view.composition import Composition, Still, Style, composition_of
 from msmpetsc.view.drawable import Drawable
 from msmpetsc.view.film import usual_speed
 from msmpetsc.view.mesh import drawn
-from msmpetsc.view.overlays import Overlays
 
-# size of positions and colours before they are packed [byte], above which frames are left out
+# size of frames before they are packed [byte], above which some are left out
 MAX_BYTES = 30_000_000
 # largest 16-bit integer
 LEVELS = 65535
@@ -44,28 +43,25 @@ def write_page(subject: Drawable, path: Path, frames: Sequence[int], style: Styl
     Raises InputError if the frames cannot be drawn or the page cannot be written.
     """
     subject = drawn(subject)
-    step = -(-7 * len(subject.rest.points) * len(frames) // MAX_BYTES)
+    step = -(-8 * len(subject.rest.points) * len(frames) // MAX_BYTES)
     chosen = [*frames[:-1:step], frames[-1]]
     if step > 1:
         log.info("%s has %d of the %d frames", path, len(chosen), len(frames))
     composition = composition_of(subject, chosen, style)
     streams = packed_frames(composition, chosen)
-    # distinct fields of the fixed shares, in 8 bits
-    states: dict[bytes, int] = {}
-    fixed = (np.rint(255 * composition.subject.fixed(index)).astype(np.uint8) for index in chosen)
-    numbers = [states.setdefault(mask.tobytes(), len(states)) for mask in fixed]
-    streams["fixed"] = zlib.compress(b"".join(states))
-    facts = page_facts(composition, composition.stills(chosen)) | {"fixed": numbers}
+    facts = page_facts(composition, composition.stills(chosen))
     write_whole(path, page_text(composition.subject.title, facts, streams))
 
 
 def packed_frames(composition: Composition, frames: Sequence[int]) -> dict[str, bytes]:
-    """Return positions, colours and triangles as deflated bytes for the script."""
+    """Return positions, colours, fixed shares and triangles as deflated bytes for the script."""
     subject = composition.subject
+    fixed = (np.rint(255 * subject.fixed(index)).astype(np.uint8) for index in frames)
     bits = "<u2" if len(subject.rest.points) <= LEVELS else "<u4"
     return {
         "positions": deflated(changes(quantised(subject.surface, frames, composition.box))),
         "colours": deflated(changes(map(composition.colouring.numbers, frames))),
+        "fixed": deflated(changes(fixed)),
         "triangles": zlib.compress(subject.triangles.astype(bits).tobytes(), 6),
     }
 
@@ -106,21 +102,9 @@ def page_facts(composition: Composition, stills: Sequence[Still]) -> dict[str, A
         "camera": asdict(composition.camera),
         "scale": composition.colouring.table,
         "legend": [vars(entry) for entry in entries_of(composition, stills)],
-        "overlays": distinct([still.overlays for still in stills]),
+        "overlays": [asdict(still.overlays) for still in stills],
         "solids": {number: solid_facts(solid) for number, solid in subject.solids.items()},
     }
-
-
-def json_text(facts: Any) -> str:
-    """Return values, including arrays, as JSON."""
-    return json.dumps(facts, separators=(",", ":"), default=np.ndarray.tolist)
-
-
-def distinct(overlays: Sequence[Overlays]) -> dict[str, list[Any]]:
-    """Return the distinct states of obstacles and arrows, and the number of each frame's state."""
-    states: dict[str, int] = {}
-    numbers = [states.setdefault(json_text(asdict(shown)), len(states)) for shown in overlays]
-    return {"states": [json.loads(state) for state in states], "numbers": numbers}
 
 
 def solid_facts(surface: Surface) -> dict[str, Floats]:
@@ -140,14 +124,15 @@ def page_text(title: str, facts: dict[str, Any], streams: dict[str, bytes]) -> s
     data = facts | {
         "streams": {name: base64.b64encode(stream).decode() for name, stream in streams.items()}
     }
+    text = json.dumps(data, separators=(",", ":"), default=np.ndarray.tolist)
     parts = {
         "title": html.escape(title),
         "css": (PARTS / "page.css").read_text(encoding="utf-8"),
         "script": "\n".join((PARTS / name).read_text(encoding="utf-8") for name in SCRIPTS),
         # a literal "</script>" would end the script
-        "data": json_text(data).replace("<", "\\u003c"),
+        "data": text.replace("<", "\\u003c"),
     }
-    text = (PARTS / "page.html").read_text(encoding="utf-8")
+    page = (PARTS / "page.html").read_text(encoding="utf-8")
     for name, part in parts.items():
-        text = text.replace(f"{{{{ {name} }}}}", part)
-    return text
+        page = page.replace(f"{{{{ {name} }}}}", part)
+    return page

@@ -103,7 +103,7 @@ function loadFrame() {
   const at = all.subarray(3 * points * counted, 3 * points * (counted + 1));
   filled("positions", at);
   filled("normals", normals(at));
-  filled("fixing", fixing.subarray(points * data.fixed[counted], points * (data.fixed[counted] + 1)));
+  filled("fixing", fixing.subarray(points * counted, points * (counted + 1)));
   filled("numbers", numbers.subarray(points * counted, points * (counted + 1)));
 }
 
@@ -117,7 +117,7 @@ function axesOfEye() {
 }
 
 function firstExtent() { // twice how far all that is ever drawn reaches from the middle, across and upward
-  const beside = data.overlays.states.flatMap(({ grounds, glass, balls, meshes }) => [
+  const beside = data.overlays.flatMap(({ grounds, glass, balls, meshes }) => [
     ...grounds.map((ground) => CORNERS.map((corner) => below(ground, corner))), ...glass, ...[...balls, ...meshes].map((round) => round.seen)]);
   const { across, upward } = axesOfEye(), every = [...CORNERS, ...beside.flat()];
   return [across, upward].map((axis) => 2 * Math.max(...every.map((point) => Math.abs(dot(axis, sum(point, middle, -1))))));
@@ -260,7 +260,7 @@ function draw() {
   gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
   loadFrame();
   const eye = axesOfEye(), matrix = cameraMatrix(eye);
-  const state = data.overlays.states[data.overlays.numbers[view.frame]];
+  const state = data.overlays[view.frame];
   for (const ground of state.grounds) drawGround(matrix, ground, eye);
   for (const mesh of state.meshes) drawMesh(matrix, eye, mesh);
   drawBody(matrix, eye);

@@ -151,7 +151,7 @@ let extent;
 async function begin() {
   const packed = (await inflated("triangles")).buffer;
   triangles = new (points > 65535 ? Uint32Array : Uint16Array)(packed);
-  fixing = await inflated("fixed");
+  fixing = summed(await inflated("fixed"), points);
   all = summed(new Uint16Array((await inflated("positions")).buffer), 3 * points);
   numbers = summed(await inflated("colours"), points);
   extent = firstExtent();

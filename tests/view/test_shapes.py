@@ -99,7 +99,7 @@ def test_a_page_has_it_once_and_moves_it(result: Path):
     render(result, "-o", path, "--eye", "0,-1,0")
     data = data_of(path)
     assert len(data["solids"]["1"]["corners"]) == 9 * 12
-    assert [len(state["meshes"]) for state in data["overlays"]["states"]] == [1] * 10 + [0]
+    assert [len(state["meshes"]) for state in data["overlays"]] == [1] * 10 + [0]
     with Browser(path) as browser:
         pictures = [browser.picture() for frame in (0, 5) if not browser.value(f"goTo({frame})")]
     rows, columns, metre = right_of_the_ball(pictures[0])

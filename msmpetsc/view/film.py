@@ -42,7 +42,7 @@ class Playback:
 
     numbers : position in the list of frames of each picture's frame
     fps     : pictures per second
-    speed   : simulated seconds per second; 0 if the frames are not in order of time
+    speed   : simulated seconds per second
     """
 
     numbers: Indices
@@ -52,7 +52,7 @@ class Playback:
     @property
     def words(self) -> str:
         """The speed in words, "10 times slower than real"; "" in real time."""
-        if self.speed in (0.0, 1.0):
+        if self.speed == 1.0:
             return ""
         if self.speed < 1:
             return f"{1 / self.speed:.3g} times slower than real"
@@ -73,19 +73,16 @@ def usual_speed(span: float) -> float:
 def playback_of(times: Floats, speed: float | None = None) -> Playback:
     """Return which frame each picture shows, and the speed of the film.
 
-    Pictures are at equal intervals and show the nearest frame. A single frame, or frames whose
-    times do not increase, are shown in turn, 10 pictures a second.
+    Pictures are at equal intervals and show the nearest frame.
 
     times : (k,) of the frames [s]
     speed : simulated seconds per second; None for a round speed by which the film lasts 3 to 8 s
 
-    Raises InputError for a speed of frames that are shown in turn, and for a film of over an hour.
+    Raises InputError for frames out of order, and for a film of over an hour.
     """
     steps = np.diff(times)
-    if len(times) == 1 or not (steps > 0).all():
-        if speed is not None:
-            raise InputError("--speed needs frames in order of time, more than one")
-        return Playback(np.arange(len(times)), MAX_FPS / 3, 0.0)
+    if not (len(steps) and (steps > 0).all()):
+        raise InputError("a film needs frames in order of time, more than one")
     speed = speed or usual_speed(float(times[-1] - times[0]))
     if (seconds := float(times[-1] - times[0]) / speed) > LONGEST_FILM:
         raise InputError(f"--speed {speed:g}: the film would last {seconds:.2g} s, over an hour")
@@ -103,9 +100,8 @@ def write_film(
     played = [frames[number] for number in playback.numbers]
     composition = composition_of(drawn(subject), played, style)
     stills = composition.stills(played, playback.words)
-    if playback.speed:
-        seconds = len(played) / playback.fps
-        log.info("the film lasts %.2g s, %s", seconds, playback.words or "in real time")
+    seconds = len(played) / playback.fps
+    log.info("the film lasts %.2g s, %s", seconds, playback.words or "in real time")
     size = style.size or _default_size(composition, stills)
     write_pictures(path, _pictures(composition, stills, size), size, playback.fps)
 

@@ -65,22 +65,20 @@ class Chunk:
         self.parts: list[bytes] = []
         self.size = 0
 
-    def add(self, rows: Array, use: int | None = None, bounds: bool = False) -> int:
+    def add(self, rows: Array, use: int | None = None) -> int:
         """Add numbers (n,) or vectors (n, 3), float32 or uint32; return the accessor's index.
 
-        use    : target of the buffer view, POINTS or TRIANGLES
-        bounds : whether to add the minimum and maximum, as points, morph targets and times require
+        use : target of the buffer view, POINTS or TRIANGLES
         """
-        component = UNSIGNED if use == TRIANGLES else FLOAT
-        accessor: dict[str, Any] = {
+        ends = np.reshape([rows.min(axis=0), rows.max(axis=0)], (2, -1)).tolist()
+        accessor = {
             "bufferView": len(self.views),
-            "componentType": component,
+            "componentType": UNSIGNED if use == TRIANGLES else FLOAT,
             "count": len(rows),
+            "type": "VEC3" if rows.ndim == 2 else "SCALAR",
+            "min": ends[0],
+            "max": ends[1],
         }
-        accessor["type"] = "VEC3" if rows.ndim == 2 else "SCALAR"
-        if bounds:
-            ends = np.reshape([rows.min(axis=0), rows.max(axis=0)], (2, -1)).tolist()
-            accessor |= {"min": ends[0], "max": ends[1]}
         view = {"buffer": 0, "byteOffset": self.size, "byteLength": rows.nbytes}
         self.views.append(view | ({"target": use} if use else {}))
         self.accessors.append(accessor)
@@ -91,7 +89,7 @@ class Chunk:
     def add_shape(self, points: Array, normals: Array) -> dict[str, int]:
         """Add points and normals, (v, 3) float32 each; return their accessors."""
         return {
-            "POSITION": self.add(points, POINTS, bounds=True),
+            "POSITION": self.add(points, POINTS),
             "NORMAL": self.add(normals, POINTS),
         }
 
@@ -161,7 +159,7 @@ def _animation(chunk: Chunk, times: Floats, targets: int) -> dict[str, Any]:
     since = (times - times[0]).astype(np.float32)
     weights = np.eye(targets + 1, targets, -1, np.float32).ravel()
     sampler = {
-        "input": chunk.add(since, bounds=True),
+        "input": chunk.add(since),
         "output": chunk.add(weights),
         "interpolation": "LINEAR",
     }

@@ -89,13 +89,13 @@ def test_gltf_keeps_to_its_rules(result: Path, tmp_path: Path):
     assert document["buffers"][0]["byteLength"] == len(data) - 28 - length
     for accessor in document["accessors"]:
         view = document["bufferViews"][accessor["bufferView"]]
+        kind = {5126: "<f4", 5125: "<u4"}[accessor["componentType"]]
         values = np.frombuffer(
-            data, "<f4", view["byteLength"] // 4, 28 + length + view["byteOffset"]
+            data, kind, view["byteLength"] // 4, 28 + length + view["byteOffset"]
         )
-        if "min" in accessor:
-            rows = values.reshape(accessor["count"], -1)
-            assert np.array_equal(rows.min(axis=0), np.float32(accessor["min"]))
-            assert np.array_equal(rows.max(axis=0), np.float32(accessor["max"]))
+        rows = values.reshape(accessor["count"], -1)
+        assert np.array_equal(rows.min(axis=0), np.array(accessor["min"], kind))
+        assert np.array_equal(rows.max(axis=0), np.array(accessor["max"], kind))
     one = json.loads(
         export(result, tmp_path / "one.glb", frames=[2]).read_bytes()[20:].split(b"BIN\0")[0][:-4]
     )

@@ -67,7 +67,4 @@ def camera_facing(
 
 def unit(vector: ArrayLike) -> Floats:
     """Return a vector (3,) normalised to length 1."""
-    given: Floats = np.asarray(vector, float)
-    # scaled first, so that squares neither overflow nor underflow
-    scaled: Floats = given / np.abs(given).max()
-    return np.divide(scaled, np.linalg.norm(scaled))
+    return np.divide(vector, np.linalg.norm(vector))

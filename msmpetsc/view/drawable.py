@@ -21,15 +21,6 @@ if TYPE_CHECKING:
     from msmpetsc.build import Model
     from msmpetsc.scene.reading import Scene
 
-# datasets without which a result cannot be drawn
-REQUIRED = (
-    "lattice/cells",
-    "surface/points",
-    "surface/triangles",
-    "frames/kinetic",
-    "frames/elastic",
-    "frames/potential",
-)
 # largest coordinate [m]; VTK squares coordinates in single precision
 FARTHEST = 1e15
 
@@ -166,9 +157,8 @@ def drawable_of_result(run: Result) -> Drawable:
         raise InputError(
             f"{run.path} has no surface to draw: its scene says output.surface = false"
         )
-    for name in REQUIRED:
-        if len(run[name]) == 0:
-            raise InputError(f"{run.path} is damaged, or has no finished frame: {name} is empty")
+    if not len(run.frames):
+        raise InputError(f"{run.path} has no finished frame")
     nodes = run.lattice.nodes[:]
     bodies = run.body_of("lattice"), run.body_of("surface")
     pinned = np.zeros(len(nodes), bool)

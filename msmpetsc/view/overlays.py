@@ -134,7 +134,7 @@ def _add_plane(
     shown: Overlays, point: Floats, normal: Floats, bodies: Positions, camera: Camera
 ) -> None:
     """Add a plane near the bodies: as ground, or as a glass plate if it hides the bodies."""
-    extent = _longest_side(bodies)
+    extent = np.ptp(bodies, axis=0).max()
     if ((bodies - point) @ normal).min() > NEAR * extent:
         return
     sides = _sides(normal)
@@ -151,11 +151,6 @@ def _add_plane(
         shown.glass.append(np.concatenate([front, front - THICKNESS * extent * normal]))
 
 
-def _longest_side(bodies: Positions) -> float:
-    """Return the longest side [m] of the box around points (n, 3)."""
-    return float(np.ptp(bodies, axis=0).max())
-
-
 def _sides(normal: Floats) -> Rows:
     """Return two orthogonal unit vectors (2, 3) in a plane, the first along an axis if possible."""
     across = min(np.eye(3), key=lambda axis: abs(axis @ normal))
@@ -170,15 +165,10 @@ def _box(box: Positions, bodies: Positions) -> list[Positions]:
     margin = (CUT - 1) / 2 * extent
     long = box[1] - box[0] > CUT * extent
     box = np.where(long, np.clip(box, low - margin, high + margin), box)
-    if not _is_near(box, bodies) or (box[0] >= box[1]).any():
+    gap = np.maximum(box[0] - high, low - box[1]).max()
+    if gap > NEAR * extent.max() or (box[0] >= box[1]).any():
         return []
     return [np.array([*product(*box.T)])]
-
-
-def _is_near(box: Positions, bodies: Positions) -> bool:
-    """Return whether a box (2, 3) is near enough to the bodies to be shown."""
-    gap = np.maximum(box[0] - bodies.max(axis=0), bodies.min(axis=0) - box[1]).max()
-    return bool(gap <= NEAR * _longest_side(bodies))
 
 
 def _arrows(subject: Drawable, index: int) -> list[Positions]:

@@ -72,9 +72,6 @@ class Comparison:
     left_out: list[str]
 
 
-Distances = tuple[Floats, Indices, float]
-
-
 # values that overflow are reported as different
 @np.errstate(all="ignore")
 def compare(a: Result, b: Result) -> Comparison:
@@ -106,7 +103,7 @@ def rest_of(run: Result, name: str) -> Positions | None:
     return run[at_rest][:] if at_rest in run else None
 
 
-def _distances(a: Result, b: Result, name: str, pairs: Indices) -> Distances:
+def _distances(a: Result, b: Result, name: str, pairs: Indices) -> tuple[Floats, Indices, float]:
     """Return a field's largest difference, the row of it, (p,) each, and the field's largest size.
 
     Sizes are taken over all compared frames, for positions relative to rest. The zero of the

@@ -54,8 +54,7 @@ class LazyArray:
         self.planned: tuple[int, ...] = dataset.shape
         self.shape: tuple[int, ...] = (len(dataset) if count is None else count, *dataset.shape[1:])
         self.dtype = dataset.dtype
-        # version 0.2 and earlier wrote "unit"
-        unit = dataset.attrs.get("units", dataset.attrs.get("unit", "1"))
+        unit = dataset.attrs.get("units", "1")
         self.unit = unit if isinstance(unit, str) else "1"
 
     @property
@@ -265,11 +264,6 @@ class Result:
             W.check_format(full_check=True)
         except ValueError as error:
             raise InputError(f"{self.path}: embedding is no matrix: {one_line(error)}") from error
-        if "points" in self.surface and W.shape[0] != len(self.surface.points):
-            raise InputError(
-                f"{self.path}: embedding has {W.shape[0]} rows for "
-                f"{len(self.surface.points)} points"
-            )
         return W
 
     def body_of(self, group: str) -> Indices:

@@ -67,8 +67,6 @@ def _check_is_result(path: Path, file: h5py.File) -> None:
         raise InputError(
             f"{path} is a result of format_version {version}; {FORMAT_VERSION} is read here"
         )
-    if not isinstance(object_at(path, file, "frames"), h5py.Group):
-        raise InputError(f"{path} is not a result of msmpetsc run: it has no frames")
     checked_dataset(path, file, "frames/time")
 
 
@@ -105,11 +103,11 @@ def as_python(value: Any) -> Any:
 def checked_datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
     """Return all known datasets of a result by name. Raises InputError for an invalid dataset."""
     path = Path(file.filename)
-    for name in NEEDED:
-        if object_at(path, file, name) is None:
-            raise InputError(f"{path} is damaged: it has no {name}")
-    names = [name for name in FIELDS if object_at(path, file, name) is not None]
-    datasets = {name: checked_dataset(path, file, name) for name in names}
+    datasets = {
+        name: checked_dataset(path, file, name)
+        for name in FIELDS
+        if name in NEEDED or object_at(path, file, name) is not None
+    }
     _check_sizes(path, datasets, finished(file))
     return datasets
 

@@ -15,7 +15,6 @@ error of x. The tolerance is relative to a scale for each unit:
 """
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -118,28 +117,23 @@ def allowed(steps: int, unit: str) -> float:
     return GROWTH * ERROR * steps * (steps + 1) / 2 * (1 if unit == "m" else 2)
 
 
-def differences(now: Numbers, stored: Numbers) -> Iterator[tuple[str, float, float]]:
-    """Yield name, relative difference and allowed difference of each number."""
+# values that overflow are reported as different
+@np.errstate(all="ignore")
+def differences(now: Numbers, stored: Numbers) -> list[tuple[str, float, float]]:
+    """Return name, relative difference and allowed difference of each number."""
+    rows = []
     for name in now.numbers.keys() | stored.numbers.keys():
         number = now.numbers.get(name)
         expected = stored.numbers.get(name)
-        if (
-            number is None
-            or expected is None
-            or number.unit != expected.unit
-            or np.shape(number.value) != np.shape(expected.value)
-        ):
-            yield name, np.inf, 0.0
+        if number is None or expected is None or np.shape(number.value) != np.shape(expected.value):
+            rows.append((name, np.inf, 0.0))
             continue
         difference = np.abs(np.subtract(number.value, expected.value, dtype=float)).max()
         # a damaged file may hold any scale
         scale = min(now.scales[number.unit], stored.scales[number.unit])
-        relative = np.inf
-        if difference == 0:
-            relative = 0.0
-        elif scale > 0 and np.isfinite(difference):
-            relative = float(difference / scale)
-        yield name, relative, allowed(stored.run.steps, number.unit)
+        relative = float(np.divide(difference, scale)) if difference else 0.0
+        rows.append((name, relative, allowed(stored.run.steps, number.unit)))
+    return rows
 
 
 def judged(now: Numbers, stored: Numbers) -> list[str]:

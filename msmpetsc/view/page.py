@@ -9,7 +9,7 @@ import base64
 import html
 import json
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
@@ -18,7 +18,7 @@ from typing import Any
 import igl
 import numpy as np
 
-from msmpetsc.backend.arrays import Array, Floats, Positions
+from msmpetsc.backend.arrays import Array, Floats
 from msmpetsc.comm import log
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.results.disk import write_whole
@@ -56,37 +56,31 @@ def write_page(subject: Drawable, path: Path, frames: Sequence[int], style: Styl
 def packed_frames(composition: Composition, frames: Sequence[int]) -> dict[str, bytes]:
     """Return positions, colours, fixed shares and triangles as deflated bytes for the script."""
     subject = composition.subject
+    low, high = composition.box
+    scale = LEVELS / np.maximum(high - low, np.finfo(float).tiny)
+    positions = (
+        np.rint((subject.surface(index) - low) * scale).clip(0, LEVELS).astype("<u2")
+        for index in counted(frames, "frames packed")
+    )
     fixed = (np.rint(255 * subject.fixed(index)).astype(np.uint8) for index in frames)
     bits = "<u2" if len(subject.rest.points) <= LEVELS else "<u4"
     return {
-        "positions": deflated(changes(quantised(subject.surface, frames, composition.box))),
-        "colours": deflated(changes(map(composition.colouring.numbers, frames))),
-        "fixed": deflated(changes(fixed)),
-        "triangles": zlib.compress(subject.triangles.astype(bits).tobytes(), 6),
+        "positions": deflated(positions),
+        "colours": deflated(map(composition.colouring.numbers, frames)),
+        "fixed": deflated(fixed),
+        "triangles": zlib.compress(subject.triangles.astype(bits).tobytes()),
     }
 
 
-def quantised(
-    points: Callable[[int], Positions], frames: Iterable[int], box: Positions
-) -> Iterator[Array]:
-    """Yield the points (v, 3) of each frame as 16-bit integers over a box (2, 3) [m]."""
-    scale = LEVELS / np.maximum(np.ptp(box, axis=0), np.finfo(float).tiny)
-    for index in counted(list(frames), "frames packed"):
-        yield np.clip(np.round((points(index) - box[0]) * scale), 0, LEVELS).astype("<u2")
-
-
-def changes(frames: Iterable[Array]) -> Iterator[bytes]:
-    """Yield the difference of each frame from the previous frame, in unsigned numbers that wrap."""
-    before = None
+def deflated(frames: Iterable[Array]) -> bytes:
+    """Return the deflated differences of frames from the previous, in numbers that wrap."""
+    packer = zlib.compressobj()
+    parts = []
+    before: Any = 0
     for frame in frames:
-        yield (frame if before is None else frame - before).tobytes()
+        parts.append(packer.compress((frame - before).tobytes()))
         before = frame
-
-
-def deflated(parts: Iterable[bytes]) -> bytes:
-    """Return consecutive parts as a single deflated stream."""
-    packer = zlib.compressobj(6)
-    return b"".join([*map(packer.compress, parts), packer.flush()])
+    return b"".join([*parts, packer.flush()])
 
 
 def page_facts(composition: Composition, stills: Sequence[Still]) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from msmpetsc.results.reader import Result
 from msmpetsc.results.untrusted_file import as_python, plain_damage
 from msmpetsc.scene.reading import scene_of
 
-# largest distance of a checkpoint from a frame, in longest sides [-]; excludes damaged numbers
+# largest distance of a checkpoint from a frame, in longest sides [-]; for damaged files
 FARTHEST = 1e6
 # difference of equal lattices relative to the largest value [-]; the order of sums over
 # cells depends on the number of ranks

@@ -23,7 +23,7 @@ ENERGIES = ("kinetic", "elastic", "potential", "contact")
 COMPARED = ("position", "surface", *ENERGIES, "momentum")
 # strain of the body or a spring below which a difference is rounding [-]
 LEAST_STRAIN = 1e-6
-# distance within which two points at rest are the same, relative to the longest side [-]
+# distance within which points at rest are the same, relative to the longest side [-]
 SAME_POINT = 1e-6
 # difference within which two times are the same, relative to the frames' spacing [-]
 SAME_TIME = 1e-6
@@ -196,7 +196,7 @@ def first_mismatch(a: Positions, b: Positions, kind: str) -> str:
     """Return in words how points (n, 3) [m] at rest first differ; "" if they are the same."""
     if len(a) != len(b):
         return f"{len(a)} and {len(b)} {kind}s"
-    same = rows_agree(a, b, SAME_POINT * longest_side(a, np.zeros(len(a))))
+    same = rows_agree(a, b, SAME_POINT * longest_side(a, np.zeros(len(a), int)))
     if same.all():
         return ""
     first = int(np.argmin(same))

@@ -290,6 +290,5 @@ def test_a_step_that_does_not_converge_leaves_the_frames_before_it(
     )
     assert_one_line(done, 3, "frame 3 ", "DIVERGED_MAX_IT", "residual", "try ")
     with h5py.File(out) as file:
-        assert finished(file) == len(file["frames/position"]) == 3
-        assert np.isfinite(file["frames/position"][:]).all()
+        assert finished(file) == 3 and np.isfinite(file["frames/position"][:3]).all()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["o.h5", "o.xdmf"]

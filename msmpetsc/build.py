@@ -177,11 +177,9 @@ class Geometry:
 
         Collective.
         """
-        return (
-            None
-            if self.cages.fills is None
-            else np.linalg.norm(nodes - self.nearest.points, axis=1)
-        )
+        if not self.cages.is_weighted:
+            return None
+        return np.linalg.norm(nodes - self.nearest.points, axis=1)
 
 
 def build_model(
@@ -346,9 +344,7 @@ def _check_size(surface: Surface, size: float | None) -> list[str]:
 def fill_cages(bodies: Sequence[BodySurface], scene: Scene) -> Cages:
     """Return the scene's valid cells (collective)."""
     cages = scene.cages
-    cell_size = cages.cell_size or choose_cell_size(
-        bodies, cages.count or 0, cages.max_cells, cages.boundary
-    )
+    cell_size = cages.cell_size or choose_cell_size(bodies, cages.count or 0, cages.max_cells)
     return fill(bodies, cell_size, cages.max_cells, cages.boundary)
 
 

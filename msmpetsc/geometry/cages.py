@@ -18,7 +18,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.geometry.cell_parts import CellParts, parts_of
 from msmpetsc.geometry.copies import NO_COPIES, Copies, find_copies
 from msmpetsc.geometry.fill_fractions import LEAK, OUTSIDE, Columns, sampled_inside
-from msmpetsc.geometry.grid import CHUNK, BodyGrids, Grid, packed, unpacked
+from msmpetsc.geometry.grid import CHUNK, CORNERS, BodyGrids, Grid, packed, unpacked
 from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
 from msmpetsc.geometry.partition import SortedKeys, ranges
 from msmpetsc.geometry.parts_of_points import PartsOfPoints
@@ -27,7 +27,7 @@ from msmpetsc.geometry.thickness import Thickness
 from msmpetsc.geometry.valid_cells import (
     Slab,
     cells_of_gaps,
-    enclosed_gaps,
+    gaps_between,
     slab_edges,
     touched_cells,
 )
@@ -67,35 +67,32 @@ class Cages:
     table       : keys of the cells (geometry.grid)
     kind        : (n_local,) uint8, BOUNDARY or INTERIOR
     fills       : (n_local, 2, 2, 2) fill of the cells' corners, from LEAST_FILL to 1 [-]
-                  (geometry.fill_fractions); None if all cells count as full
-    moments     : (n_local, 3) second moments of the material about the cells' middles [cells^5];
-                  None if all cells count as full
-    is_weighted : for each body, whether its boundary cells are weighted by their fill
+                  (geometry.fill_fractions)
+    moments     : (n_local, 3) second moments of the material about the cells' middles [cells^5]
+    is_weighted : whether boundary cells are weighted by their fill
     copies      : cells with corners of their own; None if all cells are ordinary
     parts       : finder of the part of a cell that holds a point, for each body on rank 0; None
-                  elsewhere, and for a body whose cells count as full
+                  elsewhere, and for a body without parts
     """
 
     grids: BodyGrids
     table: SortedKeys
     kind: Array
-    fills: Rows | None = None
-    moments: Rows | None = None
-    is_weighted: tuple[bool, ...] = (False,)
-    copies: Copies | None = None
-    parts: tuple[PartsOfPoints | None, ...] = (None,)
+    fills: Rows
+    moments: Rows
+    is_weighted: bool
+    copies: Copies | None
+    parts: tuple[PartsOfPoints | None, ...]
 
     @property
     def ijk(self) -> Indices:
         """Grid index (n_local, 3) of this rank's cells."""
         return decode_morton(self.table.keys)
 
-    def of_cells(self, keys: Indices, rows: Rows | None) -> Rows | None:
-        """Return ``rows`` of fills or moments of valid cells (c,) of any rank (collective).
-
-        If ``rows`` is None, return None.
-        """
-        return None if rows is None else self.table.rows_of(keys, rows)
+    def materials_of(self, keys: Indices) -> tuple[Rows, Rows]:
+        """Return the fills (c, 8) and second moments (c, 3) of cells of any rank (collective)."""
+        fills = self.table.rows_of(keys, self.fills)[:, *CORNERS.T]
+        return fills, self.table.rows_of(keys, self.moments)
 
     def corner_keys(self, keys: Indices) -> Indices:
         """Return the keys (..., 8) of the corner nodes of cells (...,)."""
@@ -109,7 +106,7 @@ class SlabCells:
 
     boundary : (b, 3) cells that the surface touches
     gaps     : (g, 4) interior cells (geometry.valid_cells)
-    columns  : fill of the boundary cells; None if not asked for, or if the winding is inconsistent
+    columns  : fill of the boundary cells; None if the surface is open or wound inconsistently
     """
 
     boundary: Indices
@@ -140,26 +137,22 @@ def fill(
     """
     comm = bodies[0].comm
     grids = BodyGrids.covering([body.bounds for body in bodies], cell_size)
-    slabs = slabs_of_all(bodies, grids, max_cells, boundary)
-    refuse_beyond_memory(comm, sum(cells.count(comm) for cells in slabs))
-    of_parts = _parts_of_all(bodies, grids, slabs)
-    cells = [_cells_of(*part, boundary) for part in zip(bodies, grids.grids, slabs, strict=True)]
-    _warn_of_masses(bodies, cells, cell_size, boundary)
+    slabs = slabs_of_all(bodies, grids, max_cells)
+    is_weighted = boundary == "fill"
+    of_parts = _parts_of_all(bodies, grids, slabs) if is_weighted else [None] * len(bodies)
+    cells = [
+        _cells_of(*of_body, is_weighted) for of_body in zip(bodies, grids.grids, slabs, strict=True)
+    ]
+    _warn_of_masses(bodies, [fills for _, _, fills, _ in cells], cell_size, is_weighted)
     keys = encode_morton(
-        np.concatenate([ijk + grids.first(body) for body, (ijk, _, _) in enumerate(cells)])
+        np.concatenate([of_body[0] + grids.first(body) for body, of_body in enumerate(cells)])
     )
-    kind = np.concatenate([kind for _, kind, _ in cells])
-    is_weighted = tuple(cut is not None for _, _, cut in cells)
-    columns: list[Array] = [kind]
-    if any(is_weighted):
-        of_bodies = [_full_cells(len(kind)) if cut is None else cut for _, kind, cut in cells]
-        columns += [np.concatenate(rows) for rows in zip(*of_bodies, strict=True)]
-        keys, columns = _with_copies(comm, grids, of_parts, keys, columns)
+    _, *columns = (np.concatenate(rows) for rows in zip(*cells, strict=True))
+    keys, columns = _with_copies(comm, grids, of_parts, keys, columns)
     table = SortedKeys(comm, keys)
     route = Route(comm, table.owner(keys))
     order = np.argsort(route.send(keys))
-    kind, *cut = (route.send(column)[order] for column in columns)
-    fills, moments = cut or (None, None)
+    kind, fills, moments = (route.send(column)[order] for column in columns)
     copies = find_copies(of_parts, grids, table)
     _log_copies(copies)
     points = tuple(parts.points if parts else None for parts in of_parts)
@@ -235,76 +228,39 @@ def _with_copies(
     return keys, [np.concatenate([whole[kept], copies]) for whole, copies in rows]
 
 
-# fills (n, 2, 2, 2) of the cells' corners, and second moments (n, 3)
-Fill = tuple[Rows, Rows]
-
-
-def _full_cells(count: int) -> Fill:
-    """Return the fills and second moments of full cells."""
-    return np.ones((count, 2, 2, 2)), np.full((count, 3), 1 / 12)
-
-
 def _cells_of(
-    body: BodySurface, grid: Grid, cells: SlabCells, boundary: str
-) -> tuple[Indices, Array, Fill | None]:
-    """Return grid index (n, 3), kind (n,), fills and second moments of a rank's cells (collective).
-
-    The last is None if the cells count as full.
-    """
+    body: BodySurface, grid: Grid, cells: SlabCells, is_weighted: bool
+) -> tuple[Indices, Array, Rows, Rows]:
+    """Return grid index (n, 3), kind, fills and second moments of a rank's cells (collective)."""
+    axes, count = np.argsort(_axes(body)), len(cells.boundary)
     interior = cells_of_gaps(cells.gaps)
-    ijk = np.concatenate([cells.boundary, interior])[:, np.argsort(_axes(body))]
-    kind = np.repeat(np.array([BOUNDARY, INTERIOR], np.uint8), [len(cells.boundary), len(interior)])
-    cut = _boundary_fill(body, grid, cells) if boundary == "fill" else None
-    if cut is None:
-        return ijk, kind, None
-    full = _full_cells(len(interior))
-    fills, moments = (np.concatenate(rows) for rows in zip(cut, full, strict=True))
-    return ijk, kind, (fills, moments)
+    ijk = np.concatenate([cells.boundary, interior])[:, axes]
+    kind = np.repeat(np.array([BOUNDARY, INTERIOR], np.uint8), [count, len(interior)])
+    fills, moments = np.ones((len(ijk), 2, 2, 2)), np.full((len(ijk), 3), 1 / 12)
+    if is_weighted and cells.columns:
+        of_corners, of_cells = cells.columns.inside(cells.boundary)
+        cut = of_corners.transpose(0, *(1 + axes)), of_cells[:, axes]
+        fills[:count], moments[:count] = _clipped(*cut)
+    elif is_weighted:
+        cut = sampled_inside(body.comm.bcast(body.surface), grid, ijk[:count])
+        fills[:count], moments[:count] = _clipped(*cut)
+    return ijk, kind, fills, moments
 
 
-def _boundary_fill(body: BodySurface, grid: Grid, cells: SlabCells) -> Fill | None:
-    """Return fills and second moments of boundary cells (collective).
-
-    Warn and return None if triangles are wound against each other. Clipping a corner's fill to
-    LEAST_FILL or 1 changes the mass at that corner, so the second moments change too.
-    """
-    axes = np.argsort(_axes(body))
-    if cells.columns is not None:
-        fills, moments = cells.columns.inside(cells.boundary)
-        fills, moments = fills.transpose(0, *(1 + axes)), moments[:, axes]
-    elif body.report.closed:
-        log.warning(
-            "triangles are wound against each other, so boundary cells count whole: "
-            'prepare = ["orient"]'
-        )
-        return None
-    else:
-        fills, moments = sampled_inside(
-            body.comm.bcast(body.surface), grid, cells.boundary[:, axes]
-        )
-    return _clipped(fills, moments)
-
-
-def _clipped(fills: Rows, moments: Rows) -> Fill:
-    """Return fills from LEAST_FILL to 1, and second moments that belong to them."""
+def _clipped(fills: Rows, moments: Rows) -> tuple[Rows, Rows]:
+    """Return fills from LEAST_FILL to 1, and second moments changed by the mass that this adds."""
     clipped = np.clip(np.where(fills > FULL, 1.0, fills), LEAST_FILL, 1.0)
     return clipped, moments + (clipped - fills).mean(axis=(1, 2, 3))[:, None] / 4
 
 
 def _warn_of_masses(
-    bodies: Sequence[BodySurface],
-    cells: Sequence[tuple[Indices, Array, Fill | None]],
-    cell_size: float,
-    boundary: str,
+    bodies: Sequence[BodySurface], fills: Sequence[Rows], cell_size: float, is_weighted: bool
 ) -> None:
     """Warn of the body whose mass differs most from its mesh, a sum of signed parts (collective).
 
-    cells : grid index, kind and fill of this rank's cells of each body
+    fills : of this rank's cells of each body
     """
-    own = [len(ijk) if cut is None else cut[0].mean(axis=(1, 2, 3)).sum() for ijk, _, cut in cells]
-    # of corners far from the inside, which _clipped gives a mass
-    far = [0 if cut is None else cut[0][cut[0] <= LEAST_FILL].sum() / 8 for _, _, cut in cells]
-    filled, raised = bodies[0].comm.allreduce(np.array([own, far], float)) * cell_size**3
+    filled = bodies[0].comm.allreduce(np.array([rows.sum() / 8 for rows in fills])) * cell_size**3
     enclosed = np.array([abs(body.report.volume) for body in bodies])
     # the volume of an open mesh has no meaning
     closed = np.array([body.report.closed for body in bodies])
@@ -312,14 +268,10 @@ def _warn_of_masses(
     worst = int(np.argmax(abs(excess)))
     if abs(excess[worst]) <= MASS_TOLERANCE:
         return
-    if boundary != "fill":
-        remedy = f'cages.boundary = "{boundary}" counts cut cells whole'
-    elif cells[worst][2] is None:
-        remedy = "cut cells count whole"
-    elif excess[worst] > 0 and raised[worst] > (filled - enclosed)[worst] / 2:
-        remedy = "it is far thinner than a cell, which smaller cells mend"
+    if not is_weighted:
+        remedy = 'cages.boundary = "whole" counts cut cells whole'
     elif excess[worst] > 0:
-        remedy = 'some parts are wound inwards, which prepare = ["orient"] mends'
+        remedy = 'it is far thinner than a cell, or parts are wound inwards: prepare = ["orient"]'
     else:
         remedy = (
             'parts overlap or lie in each other; prepare = ["union"] joins them, '
@@ -333,7 +285,7 @@ def _warn_of_masses(
 
 
 def slabs_of_all(
-    bodies: Sequence[BodySurface], grids: BodyGrids, max_cells: int, boundary: str
+    bodies: Sequence[BodySurface], grids: BodyGrids, max_cells: int
 ) -> list[SlabCells]:
     """Return the valid cells of each body in this rank's slab (collective)."""
     slabs: list[SlabCells] = []
@@ -346,34 +298,28 @@ def slabs_of_all(
         lower_bound = total + max(by_volume, by_area)
         _refuse_above(max_cells, lower_bound, grid)
         refuse_beyond_memory(comm, lower_bound)
-        slabs.append(_slab_cells(body, grid, boundary))
+        slabs.append(_slab_cells(body, grid))
         total += slabs[-1].count(comm)
         _refuse_above(max_cells, total, grid)
     return slabs
 
 
-def _slab_cells(body: BodySurface, grid: Grid, boundary: str) -> SlabCells:
+def _slab_cells(body: BodySurface, grid: Grid) -> SlabCells:
     """Return the valid cells of a body in this rank's slab (collective)."""
     axes = _axes(body)
     edges = slab_edges(body.comm.size, grid.shape[axes[0]])
     slab = Slab(*edges[body.comm.rank : body.comm.rank + 2])
     corners = _slab_triangles(body, grid, axes, edges)
-    touched = marked_cells(corners, grid.shape[axes], slab)
-    if not body.report.closed:
-        return SlabCells(touched, _gaps_by_winding(body, grid, axes, slab, touched), None)
-    gaps = enclosed_gaps(body.comm, touched, slab)
-    columns = _columns(body, corners, grid.shape[axes], slab) if boundary == "fill" else None
-    # a cavity bounded by its own surface is enclosed but lies outside the body
-    if columns is not None:
-        gaps = gaps[columns.inside(gaps[:, [0, 1, 3]])[0][:, 0, 0, 0] > OUTSIDE]
-    return SlabCells(touched, gaps, columns)
-
-
-def _columns(body: BodySurface, corners: Rows, shape: Indices, slab: Slab) -> Columns | None:
-    """Return the fill of cut cells; None if triangles are wound against each other (collective)."""
-    outwards = corners if body.report.volume > 0 else corners[:, ::-1]
-    columns = Columns.crossed(outwards, *_limits(shape, slab))
-    return columns if body.comm.allreduce(columns.leak, MPI.MAX) < LEAK else None
+    shape = grid.shape[axes]
+    touched = marked_cells(corners, shape, slab)
+    if body.report.closed:
+        outwards = corners if body.report.volume > 0 else corners[:, ::-1]
+        columns = Columns.crossed(outwards, *_limits(shape, slab))
+        if body.comm.allreduce(columns.leak, MPI.MAX) < LEAK:
+            gaps = gaps_between(touched)
+            is_inside_body = columns.inside(gaps[:, [0, 1, 3]])[0][:, 0, 0, 0] > OUTSIDE
+            return SlabCells(touched, gaps[is_inside_body], columns)
+    return SlabCells(touched, _gaps_by_winding(body, grid, axes, slab, touched), None)
 
 
 def _limits(shape: Indices, slab: Slab) -> tuple[Indices, Indices]:
@@ -431,7 +377,7 @@ def marked_cells(corners: Rows, shape: Indices, slab: Slab) -> Indices:
 def _gaps_by_winding(
     body: BodySurface, grid: Grid, axes: Indices, slab: Slab, boundary: Indices
 ) -> Indices:
-    """Return the interior cells (g, 4) of an open surface, by the winding numbers of their centres.
+    """Return the interior cells (g, 4) of a slab, by the winding numbers of their centres.
 
     The time grows with the bounding box, the memory does not. Every rank needs the whole surface
     (collective). Source: Jacobson et al. 2013.

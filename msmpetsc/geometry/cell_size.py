@@ -16,7 +16,7 @@ SEARCH_LIMIT = 30
 
 
 def choose_cell_size(
-    bodies: Sequence[BodySurface], count: int, max_cells: int = 5_000_000, boundary: str = "fill"
+    bodies: Sequence[BodySurface], count: int, max_cells: int = 5_000_000
 ) -> float:
     """Return the cell size [m] that gives ``count`` cells within 1% (collective).
 
@@ -36,7 +36,7 @@ def choose_cell_size(
     guess = np.log(estimated_size(bodies, count))
     for _ in range(SEARCH_LIMIT):
         grids = BodyGrids.covering(bounds, np.exp(guess))
-        slabs = slabs_of_all(bodies, grids, 20 * max_cells, boundary)
+        slabs = slabs_of_all(bodies, grids, 20 * max_cells)
         excess[guess] = np.log(sum(cells.count(comm) for cells in slabs) / count)
         nearest = min(excess, key=lambda size: abs(excess[size]))
         if abs(np.expm1(excess[nearest])) <= TOLERANCE:

@@ -3,29 +3,21 @@
 Everything is in cell units: cell (i, j, k) is the box [i, i+1) x [j, j+1) x [k, k+1). A cell owns
 its low faces, so a face of the body in a grid plane marks a single layer of cells.
 
-A flood from outside finds the enclosed cells. The boundary cells of a column (i, j) leave gaps
-between them, and each gap is inside or outside as a whole. So the memory follows the boundary, not
-the bounding box. Each rank floods a slab of planes i. A small graph of labels joins the components
-that meet at the face between slabs.
+The boundary cells of a column (i, j) leave gaps between them, and each gap is inside or outside as
+a whole. So the memory follows the boundary, not the bounding box. Each rank has a slab of planes i.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from mpi4py import MPI
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
-from msmpetsc.backend.arrays import Array, Indices, Mask, Rows
+from msmpetsc.backend.arrays import Array, Indices, Rows
 from msmpetsc.backend.kernel import njit
-from msmpetsc.comm import Route
-from msmpetsc.geometry.grid import PACK, packed
-from msmpetsc.geometry.morton import LIMIT
+from msmpetsc.geometry.grid import PACK
+from msmpetsc.geometry.partition import ranges
 
 # rounding of an interpolated coordinate, relative to the largest [-]; an upper bound
 ROUNDING = 1e-12
-# label of the outside
-EXTERIOR = 0
 
 
 @njit()
@@ -148,92 +140,20 @@ def slab_edges(ranks: int, planes: int) -> Indices:
     return planes * np.minimum(np.arange(ranks + 1), used) // used
 
 
-def enclosed_gaps(comm: MPI.Comm, boundary: Indices, slab: Slab) -> Indices:
-    """Return the gaps that no path of face neighbours joins with the outside (collective).
-
-    boundary : (b, 3) int64 distinct boundary cells of this rank's slab, in lexicographic order
-    returns  : (g, 4) int64 rows (i, j, k first, k last) of this slab
-    """
-    halo = _to_previous(comm, boundary[boundary[:, 0] == slab.first])
-    gaps, label = _flood(np.concatenate([boundary, halo]), slab)
-    own = gaps[:, 0] < slab.last
-    enclosed: Mask = own & (_join(comm, gaps, label, own, slab) != EXTERIOR)
-    return gaps[enclosed]
-
-
 def cells_of_gaps(gaps: Indices) -> Indices:
     """Return the cells (c, 3) int64 of gaps (i, j, k first, k last)."""
     length = gaps[:, 3] - gaps[:, 2] + 1
     cells = np.repeat(gaps[:, :3], length, axis=0)
-    cells[:, 2] += np.arange(len(cells)) - np.repeat(np.cumsum(length) - length, length)
+    cells[:, 2] = ranges(gaps[:, 2], length)
     return cells
 
 
-def _to_previous(comm: MPI.Comm, rows: Indices) -> Indices:
-    """Send rows to the rank before this rank; rank 0 sends nothing (collective)."""
-    rows = rows if comm.rank > 0 else rows[:0]
-    return Route(comm, np.full(len(rows), comm.rank - 1)).send(rows)
+def gaps_between(cells: Indices) -> Indices:
+    """Return the gaps (g, 4) between cells (c, 3) of the same column.
 
-
-def _join(comm: MPI.Comm, gaps: Indices, label: Indices, own: Mask, slab: Slab) -> Indices:
-    """Return global labels: equal for connected components of different slabs (collective)."""
-    count = int(label.max(initial=EXTERIOR))
-    offset = comm.exscan(count) or 0  # type: ignore[attr-defined]  # an intracommunicator
-    label = np.where(label == EXTERIOR, EXTERIOR, label + offset)
-    labels_beyond = _to_previous(comm, label[own & (gaps[:, 0] == slab.first)])
-    pairs = np.unique(np.stack([label[~own], labels_beyond], axis=1), axis=0)
-    pairs = np.concatenate(comm.allgather(pairs))
-    names, ends = np.unique(np.append(pairs, [EXTERIOR]), return_inverse=True)
-    ends = ends[:-1].reshape(-1, 2)
-    graph = coo_array(
-        (np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(len(names), len(names))
-    )
-    component = connected_components(graph, directed=False)[1]
-    # names[0] is EXTERIOR
-    outside = names[component == component[0]]
-    return np.where(np.isin(label, outside), EXTERIOR, label)
-
-
-def _flood(cells: Indices, slab: Slab) -> tuple[Indices, Indices]:
-    """Return gaps (g, 4) and their labels (g,): EXTERIOR, or the number of a component.
-
-    Planes first..last-1 belong to this rank. Plane ``last`` may be given as a halo; the rank that
-    owns it handles its neighbours beyond.
+    cells   : in lexicographic order
+    returns : rows (i, j, k first, k last)
     """
-    gaps = _gaps(cells)
-    plane, owned = gaps[:, 0], gaps[:, 0] < slab.last
-    before = (plane > slab.first) | (slab.first == 0)
-    sides = (([0, -1], owned), ([0, 1], owned), ([1, 0], owned), ([-1, 0], before))
-    links = [_links(cells, gaps, np.flatnonzero(chosen), np.array(side)) for side, chosen in sides]
-    ends = np.concatenate(links, axis=1)
-    graph = coo_array((np.ones(ends.shape[1]), ends), shape=(len(gaps) + 1, len(gaps) + 1))
-    component = connected_components(graph, directed=False)[1]
-    return gaps, np.where(component == component[EXTERIOR], EXTERIOR, component + 1)[1:]
-
-
-def _gaps(cells: Indices) -> Indices:
-    """Return the gaps (g, 4) between sorted cells (c, 3) of the same column."""
     low, high = cells[:-1], cells[1:]
     has_gap = (low[:, :2] == high[:, :2]).all(axis=1) & (high[:, 2] - low[:, 2] > 1)
     return np.column_stack([low[has_gap, :2], low[has_gap, 2] + 1, high[has_gap, 2] - 1])
-
-
-def _links(cells: Indices, gaps: Indices, chosen: Indices, side: Indices) -> Indices:
-    """Return pairs (2, p) of a chosen gap and a gap that touches it in the column to one side.
-
-    Gap g is node g + 1 of the graph. A gap that extends past the column's cells touches EXTERIOR.
-    """
-    column = gaps[chosen, :2] + side
-    first, last = (packed(np.column_stack([column, gaps[chosen, end]])) for end in (2, 3))
-    begins, ends = (packed(gaps[:, [0, 1, end]]) for end in (2, 3))
-    low = np.searchsorted(ends, first)
-    count = np.searchsorted(begins, last, side="right") - low
-    neighbours = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count - low, count)
-    keys = packed(cells)
-    # a last, empty column, for gaps before or after all cells
-    columns = np.append(keys // LIMIT, -2 * LIMIT)
-    below = columns[np.searchsorted(keys, first, side="right") - 1]
-    above = columns[np.searchsorted(keys, last)]
-    past = (below != first // LIMIT) | (above != first // LIMIT)
-    touched = np.append(neighbours + 1, np.full(past.sum(), EXTERIOR))
-    return np.stack([np.append(np.repeat(chosen, count), chosen[past]) + 1, touched])

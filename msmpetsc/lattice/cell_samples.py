@@ -32,10 +32,7 @@ class CellSamples:
         self._grids = cages.grids
         self.ijk = decode_morton(keys)
         self.body = cages.grids.body_of(self.ijk)
-        fills = cages.of_cells(keys, cages.fills)
-        moments = cages.of_cells(keys, cages.moments)
-        self.fills = np.ones((len(keys), 8)) if fills is None else fills[:, *CORNERS.T]
-        self.moments = np.full((len(keys), 3), 1 / 12) if moments is None else moments
+        self.fills, self.moments = cages.materials_of(keys)
         # centroid (c, 3) from the middle [cells], and square root (c, 3, 3) of 12 times
         # the covariance
         self._centroid = np.zeros((len(keys), 3))

@@ -209,9 +209,7 @@ def build_lattice(
         mass=law.mass,
         cells=net.corners,
         cell_kind=cages.kind,
-        cell_fill=np.ones(len(cages.kind))
-        if cages.fills is None
-        else cages.fills.mean(axis=(1, 2, 3)),
+        cell_fill=cages.fills.mean(axis=(1, 2, 3)),
         springs=springs.ends,
         springs_owned=springs_owned,
         rest_length=springs.rest_length,

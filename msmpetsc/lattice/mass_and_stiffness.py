@@ -21,7 +21,6 @@ from msmpetsc.lattice.material import (
 from msmpetsc.lattice.topology import (
     DIRECTION,
     DIRECTION_KIND,
-    Parts,
     SpringNet,
     Topology,
     find_slot,
@@ -75,18 +74,13 @@ def law_of_springs(
     of_cells: MaterialOfCells | None,
 ) -> LawConstants:
     """Return masses and spring stiffnesses; a spring has the mean over the cells that share it."""
-    if of_cells is None and net.cages.fills is None:
-        mass: Floats = material.density * h**3 / 8 * net.octants.sum(axis=1)
-        law = LawConstants(mass, material.spring, material.spring)
-    else:
-        owned = len(net.octants)
-        made_of, (fills, _) = _made_of(net, material, of_cells)
-        fills = np.ones((len(net.cells), 8)) if fills is None else fills
-        of_pairs = spring_fractions(fills)
-        of_corners = made_of.density[:, None] * mass_fractions(of_pairs)
-        mass = h**3 / 8 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
-        of_spring = _sums_of_springs(net, springs, made_of.spring, of_pairs) / springs.sharing
-        law = LawConstants(mass, fills.mean(axis=1) * made_of.spring, of_spring)
+    owned = len(net.octants)
+    made_of, fills, _ = _made_of(net, material, of_cells)
+    of_pairs = spring_fractions(fills)
+    of_corners = made_of.density[:, None] * mass_fractions(of_pairs)
+    mass = h**3 / 8 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
+    of_spring = _sums_of_springs(net, springs, made_of.spring, of_pairs) / springs.sharing
+    law = LawConstants(mass, fills.mean(axis=1) * made_of.spring, of_spring)
     if material.stiffness is not None:
         return law
     kind = DIRECTION_KIND[springs.direction]
@@ -96,25 +90,19 @@ def law_of_springs(
 
 def _made_of(
     net: Topology, material: Material, of_cells: MaterialOfCells | None
-) -> tuple[CellMaterial, Parts]:
+) -> tuple[CellMaterial, Rows, Rows]:
     """Return the material of the cells around a rank's nodes, by ``of_cells`` if it is given.
 
     The fills and moments returned are those of the cells' stiffness (collective).
     """
-    fills, moments = net.parts()
-    count = len(net.cells)
+    fills, moments = net.cages.materials_of(net.keys)
     if not of_cells:
         of_all = material.density, material.spring, material.poisson_ratio
-        density, spring, poisson = (np.full(count, value) for value in of_all)
-        return CellMaterial(density, spring, poisson), (fills, moments)
+        return CellMaterial(*(np.full(len(net.cells), value) for value in of_all)), fills, moments
     made_of = of_cells(net.keys)
-    if made_of.mixed is None or len(made_of.mixed.rows) == 0:
-        return made_of, (fills, moments)
-    rows, of_stiffness, moments_of_stiffness = made_of.mixed
-    fills = np.ones((count, 8)) if fills is None else fills
-    moments = np.full((count, 3), 1 / 12) if moments is None else moments
-    fills[rows], moments[rows] = of_stiffness, moments_of_stiffness
-    return made_of, (fills, moments)
+    if made_of.mixed is not None:
+        rows, fills[rows], moments[rows] = made_of.mixed
+    return made_of, fills, moments
 
 
 def law_of_solid(
@@ -125,9 +113,9 @@ def law_of_solid(
     A corner's lumped mass is proportional to the diagonal of L, as with springs.
     """
     owned, count = len(net.octants), len(net.cells)
-    made_of, parts = _made_of(net, material, of_cells)
+    made_of, *parts = _made_of(net, material, of_cells)
     shear, lame = lame_constants(made_of.spring, made_of.poisson)
-    forms, volume, cut = _forms(count, parts)
+    forms, volume, cut = _forms(*parts)
     diagonal = np.broadcast_to(
         laplacians(WHOLE[None], np.ones(1)).diagonal(axis1=1, axis2=2), (count, 8)
     )
@@ -148,11 +136,11 @@ def stiffness_of_solid(
     of_cells: MaterialOfCells | None,
 ) -> Floats:
     """Return the stiffness (s,) [N/m] of the springs of L of a solid (collective)."""
-    made_of, parts = _made_of(net, material, of_cells)
+    made_of, *parts = _made_of(net, material, of_cells)
     shear, lame = lame_constants(made_of.spring, made_of.poisson)
     count = len(net.cells)
     pairs = np.broadcast_to(laplacians(WHOLE[None], np.ones(1)), (count, 8, 8))
-    forms, volume, cut = _forms(count, parts)
+    forms, volume, cut = _forms(*parts)
     if len(cut):
         pairs = pairs.copy()
         pairs[cut] = bounding_laplacians(forms[cut], volume[cut])
@@ -160,18 +148,11 @@ def stiffness_of_solid(
     return _sums_of_springs(net, springs, -h * (2 * shear + 3 * lame), pairs)
 
 
-def _forms(count: int, parts: Parts) -> tuple[Rows, Floats, Indices]:
+def _forms(fills: Rows, moments: Rows) -> tuple[Rows, Floats, Indices]:
     """Return the strain forms (d, 13) and volumes (d,) [cells] of cells, and which are cut."""
-    forms, volume = np.broadcast_to(WHOLE, (count, len(WHOLE))), np.ones(count)
-    fills, moments = parts
-    if fills is None or moments is None:
-        return forms, volume, np.empty(0, np.int64)
-    cut = np.flatnonzero(fills.min(axis=1) < 1)
-    if len(cut):
-        forms = forms.copy()
-        volume[cut] = fills[cut].mean(axis=1)
-        forms[cut] = forms_of(fills[cut], moments[cut])
-    return forms, volume, cut
+    forms, cut = np.tile(WHOLE, (len(fills), 1)), np.flatnonzero(fills.min(axis=1) < 1)
+    forms[cut] = forms_of(fills[cut], moments[cut])
+    return forms, fills.mean(axis=1), cut
 
 
 def _sums_of_springs(net: Topology, springs: SpringNet, values: Floats, weights: Rows) -> Floats:

@@ -41,7 +41,7 @@ def nearest_of_body(bodies: Sequence[BodySurface], cages: Cages, topology: Topol
     body = cages.grids.body_of(owned)
     # a node shared by eight valid cells is inside, or in a narrow fold of the surface
     is_within = topology.octants.all(axis=1) & (topology.table.keys % COPIES == 0)
-    rows = np.flatnonzero(~is_within & np.array(cages.is_weighted)[body])
+    rows = np.flatnonzero(~is_within & cages.is_weighted)
     nearest = cages.grids.node_positions(owned)
     nearest[rows] = nearest_in_bodies(bodies, nearest[rows], body[rows])
     of_part = np.zeros(len(nearest), bool)

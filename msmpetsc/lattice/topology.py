@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Array, Indices, Mask, Rows
+from msmpetsc.backend.arrays import Array, Indices, Mask
 from msmpetsc.backend.kernel import njit
 from msmpetsc.geometry.cages import Cages
 from msmpetsc.geometry.grid import CORNERS
@@ -15,10 +15,6 @@ from msmpetsc.geometry.partition import SortedKeys
 DIRECTION = (CORNERS[None, :, :] - CORNERS[:, None, :] + 1) @ np.array([9, 3, 1])
 # kind (27,) of the spring in each direction [-]: its squared length in cells
 DIRECTION_KIND = ((np.stack(np.unravel_index(np.arange(27), (3, 3, 3))) - 1) ** 2).sum(axis=0)
-
-
-# fills (d, 8) of the corners of cells, and their second moments (d, 3)
-Parts = tuple[Rows | None, Rows | None]
 
 
 class SpringNet(NamedTuple):
@@ -67,15 +63,6 @@ class Topology(NamedTuple):
     def _numbers(self) -> Indices:
         """Global number (l,) of each local node."""
         return np.concatenate([self.table.first + np.arange(len(self.octants)), self.ghosts])
-
-    def parts(self) -> Parts:
-        """Return the fills (d, 8) and second moments (d, 3) of the cells (collective).
-
-        Both are None if all cells are whole (geometry.fill_fractions).
-        """
-        fills = self.cages.of_cells(self.keys, self.cages.fills)
-        moments = self.cages.of_cells(self.keys, self.cages.moments)
-        return None if fills is None else fills[:, *CORNERS.T], moments
 
     def count_springs(self) -> int:
         """Return the number of springs that this rank owns."""

@@ -27,7 +27,11 @@ def cages_of(cells: np.ndarray, cell_size: float = H, comm: MPI.Comm = COMM) -> 
     """Cages made of exactly these cells (c, 3)."""
     grid = Grid(ORIGIN, cell_size, cells.max(axis=0) + 1)
     table = SortedKeys(comm, encode_morton(cells)[comm.rank :: comm.size])
-    return Cages(BodyGrids((grid,)), table, np.ones(len(table.keys), np.uint8))
+    count = len(table.keys)
+    return Cages(
+        BodyGrids((grid,)), table, np.ones(count, np.uint8), np.ones((count, 2, 2, 2)),
+        np.full((count, 3), 1 / 12), is_weighted=False, copies=None, parts=(None,),
+    )  # fmt: skip
 
 
 def block(*sides: int) -> np.ndarray:

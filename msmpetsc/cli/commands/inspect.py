@@ -68,7 +68,7 @@ def partition_of(
     cells = float(wanted.count or estimated_cells(bodies, h))
     built = h
     if wanted.count or cells > MOST_BUILT:
-        built = choose_cell_size(bodies, int(min(cells, MOST_BUILT)), NO_LIMIT, wanted.boundary)
+        built = choose_cell_size(bodies, int(min(cells, MOST_BUILT)), NO_LIMIT)
     cages = fill(bodies, built, NO_LIMIT, wanted.boundary)
     partition = count_partition(topology_of(cages), ranks)
     counted = int(partition.cells.sum())

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Floats, Indices, Rows
+from msmpetsc.backend.arrays import Array, Floats, Indices, Rows
 from msmpetsc.backend.kernel import njit
 from msmpetsc.lattice.cell_moments import WHOLE, bounding_laplacians, forms_of, laplacians
 from msmpetsc.lattice.cut_cells import mass_fractions, spring_fractions
@@ -23,8 +23,6 @@ from msmpetsc.lattice.topology import (
     DIRECTION_KIND,
     SpringNet,
     Topology,
-    find_slot,
-    slots,
 )
 from msmpetsc.scene.body import Material
 
@@ -162,20 +160,18 @@ def _sums_of_springs(net: Topology, springs: SpringNet, values: Floats, weights:
 
     weights : (d, 8, 8) weight of a cell's value for the spring between two of its corners
     """
-    sums = _sums_by_slot(net.cells, values, weights, len(net.octants), net.further)
+    sums = _sums_by_slot(net.cells, values, weights, net.copy, len(net.octants))
     return sums.ravel()[springs.slot]
 
 
 @njit()
-def _sums_by_slot(cells: Indices, values: Floats, weights: Rows, owned: int, further: int) -> Rows:
-    neighbour, following = slots(owned if further else 0, further)
-    sums = np.zeros((owned + further, 27))
-    for i in range(len(cells)):
+def _sums_by_slot(cells: Indices, values: Floats, weights: Rows, copy: Array, owned: int) -> Rows:
+    copies = copy.max() + 1
+    sums = np.zeros((owned, 27 * copies))
+    for i, cell in enumerate(cells):
         for a in range(8):
-            if cells[i, a] < owned:
+            if cell[a] < owned:
                 for b in range(8):
-                    at = cells[i, a], DIRECTION[a, b]
-                    if further:
-                        at = find_slot(neighbour, following, at[0], at[1], cells[i, b])
-                    sums[at] += values[i] * weights[i, a, b]
+                    slot = copies * DIRECTION[a, b] + copy[cell[b]]
+                    sums[cell[a], slot] += values[i] * weights[i, a, b]
     return sums

@@ -22,19 +22,16 @@ class SpringNet(NamedTuple):
 
     ends    : (s, 2) local ends
     owned   : number of springs that the rank owns
-    slot    : (s,) place of each spring in the sums of its first end (``find_slot``)
+    slot    : (s,) place of each spring in the sums (owned, 27, copies) of its first end
     sharing : (s,) number of cells that share each spring
+    direction : (s,) direction of each spring from its first end, as in DIRECTION
     """
 
     ends: Indices
     owned: int
     slot: Indices
     sharing: Array
-
-    @property
-    def direction(self) -> Indices:
-        """Direction (s,) of each spring from its first end, as in DIRECTION."""
-        return self.slot % 27
+    direction: Indices
 
 
 class Topology(NamedTuple):
@@ -46,7 +43,7 @@ class Topology(NamedTuple):
     keys    : (d,) keys of all cells around the owned nodes
     cells   : (d, 8) their local corner nodes
     cages   : the cells of all ranks
-    further : number of further rows of sums, of nodes with several neighbours in a direction
+    copy    : (l,) number of each local node's copy
     """
 
     table: SortedKeys
@@ -57,7 +54,7 @@ class Topology(NamedTuple):
     keys: Indices
     cells: Indices
     cages: Cages
-    further: int
+    copy: Array
 
     @property
     def _numbers(self) -> Indices:
@@ -66,11 +63,12 @@ class Topology(NamedTuple):
 
     def count_springs(self) -> int:
         """Return the number of springs that this rank owns."""
-        return int(_neighbours(self.cells, self._numbers, len(self.octants), self.further)[-1])
+        return int(_neighbours(self.cells, self._numbers, self.copy, len(self.octants))[-1])
 
     def springs(self) -> SpringNet:
         """Return the springs between the corners of cells."""
-        return SpringNet(*_springs(self.cells, self._numbers, len(self.octants), self.further))
+        found = _springs(self.cells, self._numbers, self.copy, len(self.octants))
+        return SpringNet(*found, found[2] // (self.copy.max() + 1) % 27)
 
 
 def topology_of(cages: Cages) -> Topology:
@@ -79,30 +77,26 @@ def topology_of(cages: Cages) -> Topology:
     table = SortedKeys(cages.table.comm, corner_keys.ravel())
     corners = table.find(corner_keys)
     owned = len(table.keys)
-    keys, octants, several = _cells_around(cages, table)
+    keys, octants = _cells_around(cages, table)
     corner_keys = cages.corner_keys(keys)
     node_keys = np.concatenate([table.keys, np.setdiff1d(corner_keys, table.keys)])
     order = np.argsort(node_keys)
     cells = order[np.searchsorted(node_keys, corner_keys, sorter=order)].astype(np.int32)
     ghosts = table.find(node_keys[owned:])
     ijk = decode_morton(node_keys)
-    further = (COPIES - 1) * several
-    return Topology(table, corners, ijk, octants, ghosts, keys, cells, cages, further)
+    copy = (node_keys % COPIES).astype(np.uint8)
+    return Topology(table, corners, ijk, octants, ghosts, keys, cells, cages, copy)
 
 
-def _cells_around(cages: Cages, table: SortedKeys) -> tuple[Indices, Mask, int]:
-    """Return the cells around this rank's owned nodes (collective).
+def _cells_around(cages: Cages, table: SortedKeys) -> tuple[Indices, Mask]:
+    """Return the keys (d,) of the cells around this rank's owned nodes (collective).
 
-    The result is
-
-    - the keys (d,) of the cells,
-    - the mask (owned, 8) of the cells that have each owned node as a corner,
-    - the number of owned nodes of cells in ``cages.copies``.
+    The mask (owned, 8) tells which of the cells have each owned node as a corner.
     """
     around = encode_morton(decode_morton(table.keys)[:, None, :] - CORNERS)
     octants = cages.table.find(around) >= 0
     if cages.copies is None:
-        return np.unique(around[octants]), octants, 0
+        return np.unique(around[octants]), octants
     is_ordinary = cages.copies.place(around) < 0
     octants &= is_ordinary & (table.keys % COPIES == 0)[:, None]
     keys = around[octants]
@@ -111,100 +105,64 @@ def _cells_around(cages: Cages, table: SortedKeys) -> tuple[Indices, Mask, int]:
     cell, octant = np.nonzero(owned)
     octants[node[owned], octant] = True
     keys = np.unique(np.concatenate([keys, cages.copies.keys[cell]]))
-    return keys, octants, len(np.unique(node[owned]))
-
-
-@njit()
-def find_slot(
-    neighbour: Indices, following: Indices, node: int, direction: int, end: int
-) -> tuple[int, int]:
-    """Return the row and the column of a node's neighbour ``end`` in a direction.
-
-    A node has the row of its own number. A node with several copies of a neighbour in a direction
-    has further rows, which ``following`` chains; its last entry counts the rows in use.
-    """
-    row = node
-    while neighbour[row, direction] >= 0 and neighbour[row, direction] != end:
-        if following[row] < 0:
-            following[row] = following[-1]
-            following[-1] += 1
-        row = following[row]
-    neighbour[row, direction] = end
-    return row, direction
-
-
-@njit()
-def slots(owned: int, further: int) -> tuple[Indices, Indices]:
-    """Return empty tables ``neighbour`` and ``following`` of ``find_slot``."""
-    following = np.full(owned + further + 1, -1, np.int32)
-    following[-1] = owned
-    return np.full((owned + further, 27), -1, np.int32), following
+    return keys, octants
 
 
 @njit()
 def _neighbours(
-    cells: Indices, numbers: Indices, owned: int, further: int
-) -> tuple[Indices, Indices, Array, int, int]:
-    """Return the neighbours of nodes in cells.
+    cells: Indices, numbers: Indices, copy: Array, owned: int
+) -> tuple[Indices, Array, int, int]:
+    """Return the neighbours of nodes in cells, and the number of cells that share each neighbour.
+
+    Both are (owned, 27 copies). The last two numbers are those of the rank's springs, and of the
+    springs that it owns.
 
     cells   : (d, 8) local corner nodes; nodes below ``owned`` are owned
     numbers : (l,) global node numbers
-    further : number of further rows for nodes with several neighbours in a direction
-
-    Returns the tables of ``find_slot`` and the number of cells that share each neighbour. The last
-    two numbers are those of the rank's springs, and of the springs that it owns.
+    copy    : (l,) number of each node's copy
     """
-    neighbour, following = slots(owned, further)
-    sharing = np.zeros((owned + further, 27), np.uint8)
+    copies = copy.max() + 1
+    neighbour = np.full((owned, 27 * copies), -1, np.int32)
+    sharing = np.zeros(neighbour.shape, np.uint8)
     for cell in cells:
         for a in range(8):
             if cell[a] < owned:
                 for b in range(8):
-                    sharing[find_slot(neighbour, following, cell[a], DIRECTION[a, b], cell[b])] += 1
-    # Direction 13 is the node itself.
-    neighbour[:, 13] = -1
-    first = np.arange(owned + further)
-    for row in range(owned + further):
-        if following[row] >= 0:
-            first[following[row]] = first[row]
+                    slot = copies * DIRECTION[a, b] + copy[cell[b]]
+                    neighbour[cell[a], slot] = cell[b]
+                    sharing[cell[a], slot] += 1
     count, own = 0, 0
-    for row in range(owned + further):
-        for end in neighbour[row]:
-            is_own = end >= 0 and numbers[end] > numbers[first[row]]
+    for node in range(owned):
+        for end in neighbour[node]:
+            is_own = end >= 0 and numbers[end] > numbers[node]
             own += is_own
             count += is_own or end >= owned
-    return neighbour, following, sharing, count, own
+    return neighbour, sharing, count, own
 
 
 @njit()
 def _springs(
-    cells: Indices, numbers: Indices, owned: int, further: int
+    cells: Indices, numbers: Indices, copy: Array, owned: int
 ) -> tuple[Indices, int, Indices, Array]:
-    """Return the fields of SpringNet; the arguments are those of ``_neighbours``."""
-    neighbour, following, sharing, count, _ = _neighbours(cells, numbers, owned, further)
+    """Return SpringNet's fields without the directions; for the arguments see ``_neighbours``."""
+    neighbour, sharing, count, _ = _neighbours(cells, numbers, copy, owned)
     springs = np.empty((count, 2), np.int32)
     slot = np.empty(count, np.int64)
     shared = np.empty(count, np.uint8)
-    ends, places = np.empty(27 * COPIES, np.int64), np.empty(27 * COPIES, np.int64)
     # Owned springs fill the arrays from the front, all further springs from the back.
     low, high = 0, count
     for node in range(owned):
-        n, row = 0, node
-        while row >= 0:
-            for direction in range(27):
-                if neighbour[row, direction] >= 0:
-                    ends[n], places[n] = neighbour[row, direction], 27 * row + direction
-                    n += 1
-            row = following[row]
-        for i in np.argsort(numbers[ends[:n]]):
-            if numbers[ends[i]] > numbers[node]:
+        places = np.flatnonzero(neighbour[node] >= 0)
+        for place in places[np.argsort(numbers[neighbour[node][places]])]:
+            end = neighbour[node, place]
+            if numbers[end] > numbers[node]:
                 s = low
                 low += 1
-            elif ends[i] >= owned:
+            elif end >= owned:
                 high -= 1
                 s = high
             else:
                 continue
-            springs[s, 0], springs[s, 1] = node, ends[i]
-            slot[s], shared[s] = places[i], sharing.ravel()[places[i]]
+            springs[s, 0], springs[s, 1] = node, end
+            slot[s], shared[s] = neighbour.shape[1] * node + place, sharing[node, place]
     return springs, low, slot, shared

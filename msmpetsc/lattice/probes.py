@@ -3,20 +3,16 @@
 from collections.abc import Sequence
 
 import numpy as np
-from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Indices, Positions, Rows, to_host
+from msmpetsc.backend.arrays import Positions, Rows, to_host
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.cages import BodySurface, Cages
-from msmpetsc.geometry.embedding import cells_at
-from msmpetsc.geometry.grid import CORNERS, packed
-from msmpetsc.geometry.partition import places_of
+from msmpetsc.geometry.embedding import cells_at, embed
+from msmpetsc.geometry.grid import MOST_ON_PLANE
+from msmpetsc.lattice.embedded_surface import EmbeddedPoints
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.region import groups_named
 from msmpetsc.scene.schema import Probe
-
-# tolerance of a point's place in a cell [cell]; a point of a face lies in both cells
-ON_FACE = 1e-9
 
 
 def probe_points(bodies: Sequence[BodySurface], probes: Sequence[Probe]) -> list[Sequence[float]]:
@@ -56,54 +52,30 @@ class ProbePoints:
         Raises InputError on all ranks if a point is in no cell.
         """
         self.comm = comm = lattice.table.comm
-        of_part = np.sort(self._corners_of_parts(lattice, cages, np.array(points)), axis=1)
-        cells = to_host(lattice.local_cells)[: lattice.cells_owned]
-        low, numbers = to_host(lattice.nodes)[cells[:, 0]], lattice.global_numbers[cells[:, 0]]
-        self.corners = np.zeros((len(points), 8), np.int64)
-        self.weights = np.zeros((len(points), 8))
-        for row, point in enumerate(points):
-            place = (np.array(point) - low) / lattice.cell_size
-            around = np.flatnonzero(((place >= -ON_FACE) & (place <= 1 + ON_FACE)).all(axis=1))
-            corners = np.sort(lattice.global_numbers[cells[around]], axis=1)
-            is_own = (corners == of_part[row]).all(axis=1)
-            if comm.allreduce(bool(is_own.any()), MPI.LOR):
-                around = around[is_own]
-            own = int(numbers[around].min(initial=lattice.table.total))
-            # A point on a face or in overlapping bodies has several cells.
-            first = comm.allreduce(own, MPI.MIN)
-            if first == lattice.table.total:
-                place_text = ", ".join(f"{x:g}" for x in point)
-                raise InputError(
-                    f"output.probe.{row}.point: ({place_text}) m "
-                    "lies in no cell of the body at rest"
-                )
-            if own == first:
-                cell = around[np.argmin(numbers[around])]
-                self.corners[row] = cells[cell]
-                self.weights[row] = np.where(CORNERS == 1, place[cell], 1 - place[cell]).prod(
-                    axis=1
-                )
+        at, body = np.array(points), np.full(len(points), -1)
+        # a point of several bodies belongs to the first
+        for number, grid in reversed([*enumerate(cages.grids.grids)]):
+            # rank 0 alone has the parts of cells
+            keys = comm.bcast(cells_at(cages, number, at)[0])
+            moved = np.abs(grid.node_positions(grid.to_cells(at)) - at).max(axis=1)
+            body[(cages.table.find(keys) >= 0) & (moved <= MOST_ON_PLANE * lattice.cell_size)] = (
+                number
+            )
+        for row in np.flatnonzero(body < 0):
+            place = ", ".join(f"{x:g}" for x in at[row])
+            raise InputError(
+                f"output.probe.{row}.point: ({place}) m lies in no cell of the body at rest"
+            )
+        bodies = range(len(cages.grids.grids))
+        given = [at[(body == number) & (comm.rank == 0)] for number in bodies]
+        embedding = embed(given, cages, lattice.table, "trilinear")
+        self._points = EmbeddedPoints(comm, lattice, embedding)
+        self._row = np.argsort(np.argsort(body, kind="stable"))
 
-    @staticmethod
-    def _corners_of_parts(lattice: Lattice, cages: Cages, points: Positions) -> Indices:
-        """Return the corners (w, 8) of cells that hold points and have several parts (collective).
-
-        They are global numbers, and -1 for a point in another cell.
-        """
-        keys = np.full(len(points), -1)
-        # Rank 0 alone has the parts.
-        for body, parts in enumerate(cages.parts):
-            if parts:
-                ijk = np.floor(cages.grids.grids[body].to_cells(points)).astype(np.int64)
-                own = (places_of(parts.keys, packed(ijk)) >= 0) & (keys < 0)
-                keys[own] = cells_at(cages, body, points[own])[0]
-        keys = lattice.table.comm.bcast(keys)
-        numbers = lattice.table.find(cages.corner_keys(np.maximum(keys, 0)))
-        corners: Indices = np.where(keys[:, None] < 0, -1, numbers)
-        return corners
+    def __len__(self) -> int:
+        return len(self._row)
 
     def __call__(self, q: Positions) -> Rows:
         """Return the positions (w, 3) [m] of the points for nodes at q (l, 3) [m] (collective)."""
-        own = (self.weights[:, :, None] * to_host(q)[self.corners]).sum(axis=1)
-        places: Rows = self.comm.allreduce(own)
+        places: Rows = np.concatenate(self.comm.allgather(self._points(to_host(q))))[self._row]
         return places

@@ -310,7 +310,7 @@ class TimeLoop:
         """Return the number of this rank's rows of each optional field of a frame."""
         lattice, rows = self.model.lattice, dict(self.forces.rows)
         if self.model.probe:
-            rows["probe"] = len(self.model.probe.corners)
+            rows["probe"] = len(self.model.probe)
         if self.surface:
             rows["surface"] = self.surface.weights.shape[0]
         if self.stress:

@@ -5,7 +5,6 @@ Rank 0 holds the surfaces. Each rank finds the valid cells in its slab of each g
 the cells are distributed over the ranks in Morton order.
 """
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,7 +12,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Array, Indices, Rows
-from msmpetsc.comm import Route, log, on_root, together
+from msmpetsc.comm import Route, log, on_root
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.cell_parts import CellParts, parts_of
 from msmpetsc.geometry.copies import NO_COPIES, Copies, find_copies
@@ -37,8 +36,6 @@ BOUNDARY, INTERIOR = 1, 2
 LEAST_FILL = 1e-3
 # fill above which a corner counts as full [-]; the difference from 1 is rounding
 FULL = 1 - 1e-9
-# lattice memory a cell [byte]; a lower bound, as a whole run takes four times as much
-CELL_BYTES = 1000
 # relative error of a cell count [-]; far below the lattice's own error
 TOLERANCE = 0.01
 # relative error of a body's mass that is told [-]; far above rounding
@@ -113,14 +110,10 @@ class SlabCells:
     gaps: Indices
     columns: Columns | None
 
-    @property
-    def interior(self) -> int:
-        """Number of interior cells of this rank."""
-        return int((self.gaps[:, 3] - self.gaps[:, 2] + 1).sum())
-
     def count(self, comm: MPI.Comm) -> int:
         """Return the number of valid cells on all ranks (collective)."""
-        return int(comm.allreduce(len(self.boundary) + self.interior))
+        interior = (self.gaps[:, 3] - self.gaps[:, 2] + 1).sum()
+        return int(comm.allreduce(len(self.boundary) + interior))
 
 
 def fill(
@@ -133,7 +126,7 @@ def fill(
 
     boundary : "fill" weights a boundary cell by its fill; "whole" counts it as full (the paper)
 
-    Raises InputError if there would be more than ``max_cells`` cells, or more than memory holds.
+    Raises InputError if there would be more than ``max_cells`` cells.
     """
     comm = bodies[0].comm
     grids = BodyGrids.covering([body.bounds for body in bodies], cell_size)
@@ -295,9 +288,7 @@ def slabs_of_all(
         # lower bounds of the body's cells by its volume and its area
         by_volume = abs(body.report.volume) / grid.cell_size**3 / 2
         by_area = body.report.area / grid.cell_size**2 / 8
-        lower_bound = total + max(by_volume, by_area)
-        _refuse_above(max_cells, lower_bound, grid)
-        refuse_beyond_memory(comm, lower_bound)
+        _refuse_above(max_cells, total + max(by_volume, by_area), grid)
         slabs.append(_slab_cells(body, grid))
         total += slabs[-1].count(comm)
         _refuse_above(max_cells, total, grid)
@@ -325,18 +316,6 @@ def _slab_cells(body: BodySurface, grid: Grid) -> SlabCells:
 def _limits(shape: Indices, slab: Slab) -> tuple[Indices, Indices]:
     """Return the first cell of a slab, and the cell after its last, along each axis."""
     return np.array([slab.first, 0, 0]), np.array([slab.last, *shape[1:]])
-
-
-def refuse_beyond_memory(comm: MPI.Comm, cells: float) -> None:
-    """Raise InputError if a lattice of so many cells cannot fit into memory (collective)."""
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    needed = cells * CELL_BYTES / comm.size
-    with together(comm):
-        if needed > memory:
-            raise InputError(
-                f"cages: {cells:.3g} cells need {needed / 1e9:.3g} GB a rank or more, "
-                f"and this machine has {memory / 1e9:.3g} GB"
-            )
 
 
 def _axes(body: BodySurface) -> Indices:
@@ -367,11 +346,8 @@ def _slab_triangles(body: BodySurface, grid: Grid, axes: Indices, edges: Indices
 
 def marked_cells(corners: Rows, shape: Indices, slab: Slab) -> Indices:
     """Return the distinct cells (b, 3) of the slab that triangles touch, in lexicographic order."""
-    keys = [np.empty(0, np.int64)]
-    for start in range(0, len(corners), CHUNK):
-        touched, _ = touched_cells(corners[start : start + CHUNK], *_limits(shape, slab))
-        keys.append(np.unique(touched))
-    return unpacked(np.unique(np.concatenate(keys)))
+    touched, _ = touched_cells(corners, *_limits(shape, slab))
+    return unpacked(np.unique(touched))
 
 
 def _gaps_by_winding(

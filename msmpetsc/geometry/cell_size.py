@@ -6,7 +6,7 @@ import numpy as np
 
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, body_names
-from msmpetsc.geometry.cages import TOLERANCE, BodySurface, refuse_beyond_memory, slabs_of_all
+from msmpetsc.geometry.cages import TOLERANCE, BodySurface, slabs_of_all
 from msmpetsc.geometry.grid import BodyGrids
 from msmpetsc.geometry.thickness import ADVISED, ENOUGH
 from msmpetsc.scene.body import SOLID
@@ -24,13 +24,12 @@ def choose_cell_size(
     bracket guards it, because the number is a step function and not quite monotone. If no size
     meets the tolerance, the nearest is returned with a warning.
 
-    Raises InputError if ``count`` is more than ``max_cells``, or more than memory holds.
+    Raises InputError if ``count`` is more than ``max_cells``.
     """
     if count > max_cells:
         raise InputError(f"cages.count: {count} is more than cages.max_cells = {max_cells}")
     comm = bodies[0].comm
     bounds = [body.bounds for body in bodies]
-    refuse_beyond_memory(comm, count)
     # excess[log(size)] = log(cells / count)
     excess = {}
     guess = np.log(estimated_size(bodies, count))

@@ -98,10 +98,6 @@ def test_a_path_that_cannot_be_used_is_refused_in_one_line(folder, monkeypatch, 
 
 
 TOO_MUCH = {
-    "cells": (
-        ["run", "scene.toml", "--set", "cages={count = 1000000000, max_cells = 1000000000000}"],
-        "GB a rank or more",
-    ),
     "ranks": (
         ["inspect", "scene.toml", "--ranks", "9999999999"],
         "--ranks must be at most 1000000",

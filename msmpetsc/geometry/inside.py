@@ -2,18 +2,12 @@
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
+from msmpetsc.backend.arrays import Indices, Mask, Positions, Rows
 from msmpetsc.scene.body import Region
 
 # distance at which a point counts as on the edge, relative to the longest side [-];
 # many meshes have single precision
 EDGE = 1e-6
-
-
-def frame_of(region: Region, bounds: Rows) -> tuple[Floats, Floats, float]:
-    """Return origin (3,) [m], scale (3,) and length [m] of a region's coordinates."""
-    sides = bounds[1] - bounds[0]
-    return (bounds[0], sides, sides.max()) if region.relative else (np.zeros(3), np.ones(3), 1.0)
 
 
 def inside(region: Region, points: Positions, bounds: Rows) -> Mask:
@@ -23,7 +17,10 @@ def inside(region: Region, points: Positions, bounds: Rows) -> Mask:
 
     bounds : (2, 3) the body's bounding box at rest [m]
     """
-    origin, scale, length = frame_of(region, bounds)
+    origin, scale, length = np.zeros(3), np.ones(3), 1.0
+    if region.relative:
+        origin, scale = bounds[0], bounds[1] - bounds[0]
+        length = scale.max()
     edge = EDGE * (bounds[1] - bounds[0]).max()
     if region.box is not None:
         low, high = origin + np.array(region.box) * scale

@@ -16,19 +16,18 @@ from pathlib import Path
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
+from msmpetsc.backend.arrays import Indices, Mask, Positions, Rows
 from msmpetsc.comm import Route, log, on_root
 from msmpetsc.errors import InputError, did_you_mean, printable
 from msmpetsc.geometry.cages import BodySurface, Cages, marked_cells
 from msmpetsc.geometry.embedding import cells_at
-from msmpetsc.geometry.inside import EDGE, frame_of, inside_bodies
+from msmpetsc.geometry.inside import EDGE, inside_bodies
 from msmpetsc.geometry.morton import COPIES, encode_morton
 from msmpetsc.geometry.surface import Surface, bounds_of, examine, is_inside
 from msmpetsc.geometry.valid_cells import Slab
 from msmpetsc.lattice.cell_samples import COUNT, CellSamples
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.nearest_points import NodePoints, nearest_in_bodies
-from msmpetsc.scene.body import Region
 from msmpetsc.scene.schema import OfBody
 
 # names of groups in a message [-]; more fill the screen
@@ -159,13 +158,13 @@ class Finder:
         return shares
 
     def extents(self, table: OfBody) -> str:
-        """Return the extents of a table's bodies and of its region, for a message."""
+        """Return the extent of a table's bodies, for a message."""
         bounds = self.bounds if table.body is None else self.bounds[[table.body]]
-        body = _box_text(bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0))
-        region = table.table.region
-        return f": the body is {body}" + (
-            "" if region.is_of_mesh else f", the region {_extent(region, bounds[0])}"
+        low, high = (
+            ", ".join(f"{x:.4g}" for x in end)
+            for end in (bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0))
         )
+        return f": the body is from ({low}) to ({high}) m"
 
     def _nodes_of_mesh(self, table: OfBody, lattice: Lattice, nearest: NodePoints) -> Mask:
         """Return the mask (l,) of nodes in a region of painted points or a group (collective).
@@ -287,24 +286,3 @@ def listed(names: Sequence[str]) -> str:
     return ", ".join(printable(name, 60) for name in names[:MOST_LISTED]) + (
         f" and {more} more" if more > 0 else ""
     )
-
-
-def _box_text(low: Floats, high: Floats) -> str:
-    ends = (", ".join(f"{x:.4g}" for x in end) for end in (low, high))
-    return "from ({}) to ({}) m".format(*ends)
-
-
-def _extent(region: Region, bounds: Rows) -> str:
-    """Return a description of a region of space [m], given the bounds (2, 3) of its body."""
-    origin, scale, length = frame_of(region, bounds)
-    if region.box is not None:
-        return _box_text(*(origin + np.array(region.box) * scale))
-    if region.sphere is not None:
-        center = origin + np.array(region.sphere.center) * scale
-        radius = region.sphere.radius * length
-        return _box_text(center - radius, center + radius)
-    assert region.half_space is not None
-    point = origin + np.array(region.half_space.point) * scale
-    normal = region.half_space.normal
-    at, along = (", ".join(f"{x:.4g}" for x in vector) for vector in (point, normal))
-    return f"beyond ({at}) m towards ({along})"

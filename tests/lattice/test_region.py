@@ -49,10 +49,7 @@ def test_a_plane_that_grazes_a_body_clamps_what_it_touches(caplog):
         record.getMessage() for record in caplog.records if record.levelno == logging.WARNING
     )
     assert "is so thin" in thin
-    assert (
-        told.startswith("pin.0.region only grazes the body")
-        and "the region beyond (0, 0, 1e-06) m" in told
-    )
+    assert told.startswith("pin.0.region only grazes the body")
 
 
 @pytest.mark.parametrize(
@@ -78,7 +75,7 @@ def test_a_plane_that_grazes_a_body_leaves_it_as_soft_as_it_is(law, low, high):
 
 
 @pytest.mark.parametrize("kind", ["pin", "anchor", "force", "part"])
-def test_a_region_without_material_says_where_body_and_region_are(tmp_path, kind):
+def test_a_region_without_material_says_where_the_body_is(tmp_path, kind):
     # only nodes that stick out of the body
     table = {"region": {"box": [[0, 0, 0.251], [1, 1, 2]]}}
     own = {
@@ -88,10 +85,7 @@ def test_a_region_without_material_says_where_body_and_region_are(tmp_path, kind
     }
     table |= own.get(kind, {})
     path = block_scene(tmp_path, time=TIME, cages={"cell_size": 0.11}, **{kind: [table]})
-    where = (
-        r": the body is from \(0, 0, 0\) to \(0.5, 0.5, 0.25\) m, the region from \(0, 0, "
-        r"0.251\) to \(1, 1, 2\) m"
-    )
+    where = r": the body is from \(0, 0, 0\) to \(0.5, 0.5, 0.25\) m"
     with pytest.raises(InputError, match=rf"^{kind}\.0\.region holds .*no.*{where}$"):
         model_of(path)
 

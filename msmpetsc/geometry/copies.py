@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from scipy.ndimage import label
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -115,12 +116,12 @@ def _copies_of_body(
     is_valid = (table.find(distinct) >= 0) & (distinct >= 0)
     if parts is None or not len(nodes):
         return np.empty(0, np.int64), np.empty((0, 8), np.int64)
-    label = _node_copies(parts, cells - first, is_valid, around)
-    node, octant, part = np.nonzero(label >= 0)
+    copy = _node_copies(parts, cells - first, is_valid, around)
+    node, octant, part = np.nonzero(copy >= 0)
     distinct, place = np.unique(around[node, octant] * COPIES + part, return_inverse=True)
     ijk = cells[distinct // COPIES]
     corners = encode_morton(ijk[:, None] + CORNERS)
-    corners[place, octant] += label[node, octant, part]
+    corners[place, octant] += copy[node, octant, part]
     return encode_morton(ijk) + distinct % COPIES, corners
 
 
@@ -146,16 +147,9 @@ def _suspects(parts: CellParts) -> Indices:
 @cache
 def _disconnected() -> Mask:
     """Return for each mask (256,) of octants whether the octants are not all joined by faces."""
-    joined = [(1 << low, 1 << high) for _, low, high in FACES]
-    disconnected = np.zeros(256, bool)
-    for mask in range(1, 256):
-        reached = mask & -mask
-        for _ in range(7):
-            for low, high in joined:
-                if reached & (low | high) and mask & low and mask & high:
-                    reached |= low | high
-        disconnected[mask] = reached != mask
-    return disconnected
+    bits = np.zeros((256, 2, 2, 2), np.int64)
+    bits[:, *CORNERS.T] = np.arange(256)[:, None] >> np.arange(8) & 1
+    return np.array([label(octants)[1] > 1 for octants in bits])
 
 
 def _node_copies(parts: CellParts, cells: Indices, is_valid: Mask, around: Indices) -> Indices:

@@ -41,8 +41,6 @@ if TYPE_CHECKING:
 LEAST_AREA_KEPT = 0.5
 # share of the area that a repair may change without a warning [-]; too little to see
 MOST_CHANGED = 0.01
-# distance within which a surface is unchanged, in mean thicknesses 2 V / A [-]
-UNCHANGED_DISTANCE = 0.01
 # largest coordinate that is repaired [file's unit]; MeshFix crashes on larger values
 LARGEST_COORDINATE = 1e12
 # least number of triangles for caching a step [-]; steps on smaller meshes are fast
@@ -186,31 +184,6 @@ def repair(surface: Surface) -> Surface:
     return repaired
 
 
-def _warn_of_change(before: Surface, after: Surface) -> None:
-    """Warn if a repair has removed, or has added, more than MOST_CHANGED of the surface's area."""
-    report = examine(after)
-    near = UNCHANGED_DISTANCE * 2 * abs(report.volume) / report.area
-    removed = _share_farther_than(before, after, near)
-    added = _share_farther_than(after, before, near)
-    if max(removed, added) > MOST_CHANGED:
-        log.warning(
-            "prepare: 'repair' removed %.0f%% and added %.0f%% of the surface's area: "
-            "msmpetsc render draws the scene",
-            100 * removed,
-            100 * added,
-        )
-
-
-def _share_farther_than(surface: Surface, reference: Surface, distance: float) -> float:
-    """Return the share of a surface's area farther than ``distance`` from a reference surface."""
-    import igl
-
-    middles = surface.points[surface.triangles].mean(axis=1)
-    areas = igl.doublearea(surface.points, surface.triangles)
-    squares = igl.point_mesh_squared_distance(middles, reference.points, reference.triangles)[0]
-    return float(areas[squares > distance**2].sum() / areas.sum())
-
-
 @about_middle
 def simplify(surface: Surface, faces: int) -> Surface:
     """Reduce to about ``faces`` triangles (quadric decimation); a closed surface stays closed."""
@@ -321,7 +294,12 @@ def _apply(surface: Surface, name: str, value: object) -> Surface:
         raise InputError(f"prepare: '{name}' left no usable mesh")
     # warn here, so that a result from the cache is reported too
     if name == repair.__name__:
-        _warn_of_change(surface, result)
+        change = examine(result).area / examine(surface).area - 1
+        if abs(change) > MOST_CHANGED:
+            log.warning(
+                "prepare: 'repair' changed the surface's area by %+.0f%%: msmpetsc render draws it",
+                100 * change,
+            )
     return result if result.groups else replace(result, groups=surface.groups)
 
 

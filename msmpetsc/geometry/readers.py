@@ -20,7 +20,6 @@ from msmpetsc.comm import starts
 from msmpetsc.errors import InputError, one_line
 from msmpetsc.geometry.cell_meshes import labels_of, read_cells
 from msmpetsc.geometry.surface import Surface, compact
-from msmpetsc.scene.reading import lies_below
 
 # points (v, 3), faces (f, 3 or 4) or a list of polygons, and the faces of named groups
 Arrays = tuple[Array, Any, Mapping[str, Any]]
@@ -179,24 +178,13 @@ def _read_obj(path: Path, data: bytes) -> Arrays:
     return np.array(points), polygons, groups
 
 
-class _FolderResolver(FilePathResolver):
-    """Read the files that a glTF names, but only in its folder or below, links followed."""
-
-    def get(self, name: str) -> bytes:
-        """Return the content of a named file. Raises ValueError if it may not be read."""
-        path = Path(self.parent, name)
-        if not lies_below(Path(self.parent), name) or not path.is_file():
-            raise ValueError(f"it names {name}, which is no file in its folder")
-        return path.read_bytes()
-
-
 def _read_trimesh(path: Path, data: bytes) -> Arrays:
     """Read points, triangles and named nodes by trimesh."""
     kind = _kind(path)
     scene = trimesh.load_scene(
         BytesIO(data),
         file_type=kind,
-        resolver=_FolderResolver(str(path)),
+        resolver=FilePathResolver(str(path)),
         process=False,
         skip_materials=True,
         maintain_order=True,

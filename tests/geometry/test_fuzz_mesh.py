@@ -313,22 +313,6 @@ def test_a_mesh_opens_no_other_file(tmp_path, opened, kind):
     assert [name for name in opened if str(tmp_path) in name] == [str(tmp_path / f"x.{kind}")]
 
 
-@pytest.mark.parametrize("name", ["../secret.bin", "link.bin", "pipe.bin", "/etc/passwd", "", "."])
-def test_a_gltf_names_files_of_its_folder_only(tmp_path, opened, name):
-    folder = tmp_path / "folder"
-    folder.mkdir()
-    (tmp_path / "secret.bin").write_bytes(IN_GLTF)
-    (folder / "link.bin").symlink_to("../secret.bin")
-    os.mkfifo(folder / "pipe.bin")
-    (folder / "own.bin").write_bytes(IN_GLTF)
-    (folder / "x.gltf").write_bytes(gltf("own.bin"))
-    assert len(read_surface(folder / "x.gltf").points) == 8
-    (folder / "x.gltf").write_bytes(gltf(name))
-    opened.clear()
-    assert "no file in its folder" in refusal(lambda: read_surface(folder / "x.gltf"))
-    assert not [one for one in opened if one.endswith((".bin", "passwd"))]
-
-
 def test_what_is_instanced_as_people_do_it_is_read(tmp_path):
     scene = trimesh.Scene({"box": BOX})
     for node in range(99):

@@ -38,10 +38,9 @@ class MadeSprings(NamedTuple):
     stiffness: Floats
 
     @classmethod
-    def of(cls, net: SpringNet, h: float, stiffness: float | Floats) -> "MadeSprings":
+    def of(cls, net: SpringNet, h: float, stiffness: Floats) -> "MadeSprings":
         """Return the springs of a net on cells of size h [m]."""
-        rest_length = h * np.sqrt(DIRECTION_KIND[net.direction])
-        return cls(net.ends, rest_length, np.broadcast_to(stiffness, len(net.ends)).copy())
+        return cls(net.ends, h * np.sqrt(DIRECTION_KIND[net.direction]), stiffness)
 
 
 NO_SPRINGS = MadeSprings(np.empty((0, 2), np.int32), np.empty(0), np.empty(0))
@@ -185,10 +184,7 @@ def build_lattice(
     net = topology or topology_of(cages)
     is_solid = material.poisson is not None
     first_owned = net.cells[:, 0] < len(net.octants)
-    further = ~first_owned & is_solid
-    kept: Indices | slice = slice(None)
-    if not first_owned.all():
-        kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(further)])
+    kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(~first_owned & is_solid)])
     springs, make_springs = NO_SPRINGS, None
     if is_solid:
         make_springs = partial(_springs_of_solid, net, h, material, of_cells)
@@ -217,7 +213,7 @@ def build_lattice(
         fixed=np.zeros((len(net.ijk), 3), bool),
         local_cells=net.cells[kept],
         cells_owned=int(first_owned.sum()),
-        cell_stiffness=np.broadcast_to(law.cells, len(net.cells))[kept],
+        cell_stiffness=law.cells[kept],
         copies=cages.copies,
         first_of_body=starts(net.table.comm.allreduce(nodes_of_bodies)),
         solid=law.solid and SolidCells(*(rows[kept] for rows in law.solid)),

@@ -50,17 +50,17 @@ class SolidCells(NamedTuple):
 
 
 class LawConstants(NamedTuple):
-    """The material data of a rank's nodes, springs and cells. A scalar holds for all items.
+    """The material data of a rank's nodes, springs and cells.
 
     mass    : (owned,) [kg]
     cells   : (d,) stiffness of an edge inside a body of the cell's material [N/m]
-    springs : (s,) stiffness [N/m]; 0 if the law is a solid
+    springs : (s,) stiffness [N/m]; empty if the law is a solid
     solid   : (d,) constants of a solid's cells; None if the law is springs
     """
 
     mass: Floats
-    cells: float | Floats
-    springs: float | Floats = 0.0
+    cells: Floats
+    springs: Floats
     solid: SolidCells | None = None
 
 
@@ -123,7 +123,7 @@ def law_of_solid(
     of_corners = (made_of.density * volume / diagonal.sum(axis=1))[:, None] * diagonal
     mass = h**3 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
     cells = SolidCells(forms, h**3 * volume, shear, lame)
-    return LawConstants(mass, edge_stiffness(volume * made_of.spring, h), solid=cells)
+    return LawConstants(mass, edge_stiffness(volume * made_of.spring, h), np.empty(0), cells)
 
 
 def stiffness_of_solid(

@@ -58,7 +58,7 @@ MaterialOfCells = Callable[[Indices], CellMaterial]
 
 
 def calibrated_stiffness(
-    young_modulus: float | Floats, cell_size: float, kind: Indices, cells: Indices
+    young_modulus: Floats, cell_size: float, kind: Indices, cells: Indices
 ) -> Floats:
     """Return the spring stiffnesses (s,) [N/m] of an isotropic lattice at small strain.
 
@@ -81,7 +81,7 @@ def lame_constants(young_modulus: Floats, poisson: Floats) -> tuple[Floats, Floa
     return shear, 2 * shear * poisson / (1 - 2 * poisson)
 
 
-def edge_stiffness(young_modulus: float | Floats, cell_size: float) -> float | Floats:
+def edge_stiffness(young_modulus: Floats, cell_size: float) -> Floats:
     """Return the stiffness k1 [N/m] of an edge inside a body of Young's modulus E [Pa]."""
     return 4 / 7 * young_modulus * cell_size
 

@@ -96,7 +96,8 @@ def _made_of(
     fills, moments = net.cages.materials_of(net.keys)
     if not of_cells:
         of_all = material.density, material.spring, material.poisson_ratio
-        return CellMaterial(*(np.full(len(net.cells), value) for value in of_all)), fills, moments
+        density, spring, poisson = (np.full(len(net.cells), value) for value in of_all)
+        return CellMaterial(density, spring, poisson), fills, moments
     made_of = of_cells(net.keys)
     if made_of.mixed is not None:
         rows, fills[rows], moments[rows] = made_of.mixed

@@ -157,9 +157,7 @@ def test_copies_share_corners_at_the_end_of_the_slit_alone():
     in_slit = (ijk[:, 1] == WIDTH // 2) & (ijk[:, 2] == 0)
     for i in range(BASE, LENGTH):
         copies = net.cells[in_slit & (ijk[:, 0] == i)]
-        volumes = cages.of_cells(net.keys[in_slit & (ijk[:, 0] == i)], cages.fills).mean(
-            axis=(1, 2, 3)
-        )
+        volumes = cages.materials_of(net.keys[in_slit & (ijk[:, 0] == i)])[0].mean(axis=1)
         # the end of the slit lies in the face of the cells: its copy has no volume
         copies = copies[volumes > 0.01]
         shared = np.intersect1d(*copies)
@@ -179,7 +177,7 @@ def test_the_surface_follows_its_own_part(tmp_path: Path):
         np.testing.assert_allclose(weights @ nodes, body.surface.points, atol=1e-6)
         # nodes beyond the end of the slit are labelled by the prong that their cells
         # fill
-        fills = cages.of_cells(net.keys, cages.fills).mean(axis=(1, 2, 3))
+        fills = cages.materials_of(net.keys)[0].mean(axis=1)
         ijk = decode_morton(net.keys)
         side = np.zeros(len(net.ijk))
         for low in (True, False):

@@ -24,10 +24,8 @@ from msmpetsc.geometry.parts_of_points import PartsOfPoints
 from msmpetsc.geometry.surface import Surface, SurfaceReport, is_inside
 from msmpetsc.geometry.thickness import Thickness
 from msmpetsc.geometry.valid_cells import (
-    Slab,
     cells_of_gaps,
     gaps_between,
-    slab_edges,
     touched_cells,
 )
 
@@ -297,25 +295,20 @@ def slabs_of_all(
 
 def _slab_cells(body: BodySurface, grid: Grid) -> SlabCells:
     """Return the valid cells of a body in this rank's slab (collective)."""
-    axes = _axes(body)
-    edges = slab_edges(body.comm.size, grid.shape[axes[0]])
-    slab = Slab(*edges[body.comm.rank : body.comm.rank + 2])
-    corners = _slab_triangles(body, grid, axes, edges)
+    axes, rank = _axes(body), body.comm.rank
     shape = grid.shape[axes]
-    touched = marked_cells(corners, shape, slab)
+    edges = shape[0] * np.arange(body.comm.size + 1) // body.comm.size
+    limits = np.array([edges[rank], 0, 0]), np.array([edges[rank + 1], *shape[1:]])
+    corners = _slab_triangles(body, grid, axes, edges)
+    touched = marked_cells(corners, *limits)
     if body.report.closed:
         outwards = corners if body.report.volume > 0 else corners[:, ::-1]
-        columns = Columns.crossed(outwards, *_limits(shape, slab))
+        columns = Columns.crossed(outwards, *limits)
         if body.comm.allreduce(columns.leak, MPI.MAX) < LEAK:
             gaps = gaps_between(touched)
             is_inside_body = columns.inside(gaps[:, [0, 1, 3]])[0][:, 0, 0, 0] > OUTSIDE
             return SlabCells(touched, gaps[is_inside_body], columns)
-    return SlabCells(touched, _gaps_by_winding(body, grid, axes, slab, touched), None)
-
-
-def _limits(shape: Indices, slab: Slab) -> tuple[Indices, Indices]:
-    """Return the first cell of a slab, and the cell after its last, along each axis."""
-    return np.array([slab.first, 0, 0]), np.array([slab.last, *shape[1:]])
+    return SlabCells(touched, _gaps_by_winding(body, grid, axes, edges, touched), None)
 
 
 def _axes(body: BodySurface) -> Indices:
@@ -344,14 +337,14 @@ def _slab_triangles(body: BodySurface, grid: Grid, axes: Indices, edges: Indices
     return Route(body.comm, ranges(first, copies)).send(np.repeat(corners, copies, axis=0))
 
 
-def marked_cells(corners: Rows, shape: Indices, slab: Slab) -> Indices:
-    """Return the distinct cells (b, 3) of the slab that triangles touch, in lexicographic order."""
-    touched, _ = touched_cells(corners, *_limits(shape, slab))
+def marked_cells(corners: Rows, low: Indices, high: Indices) -> Indices:
+    """Return the distinct cells (b, 3), low <= cell < high, that triangles touch, in order."""
+    touched, _ = touched_cells(corners, low, high)
     return unpacked(np.unique(touched))
 
 
 def _gaps_by_winding(
-    body: BodySurface, grid: Grid, axes: Indices, slab: Slab, boundary: Indices
+    body: BodySurface, grid: Grid, axes: Indices, edges: Indices, boundary: Indices
 ) -> Indices:
     """Return the interior cells (g, 4) of a slab, by the winding numbers of their centres.
 
@@ -361,8 +354,7 @@ def _gaps_by_winding(
     surface = body.comm.bcast(body.surface)
     shape = grid.shape[axes]
     marked = packed(boundary)
-    plane = shape[1] * shape[2]
-    first, last = slab.first * plane, slab.last * plane
+    first, last = edges[body.comm.rank : body.comm.rank + 2] * shape[1] * shape[2]
     gaps = [np.empty((0, 4), np.int64)]
     for start in range(first, last, CHUNK):
         cells = np.stack(

@@ -15,7 +15,7 @@ from msmpetsc.backend.arrays import Array, Floats, Indices, Rows
 from msmpetsc.backend.kernel import njit
 from msmpetsc.backend.trees import root
 from msmpetsc.geometry.morton import COPIES
-from msmpetsc.geometry.valid_cells import clip_between
+from msmpetsc.geometry.valid_cells import clip_between, grown
 
 # lines along each axis of a cell, in a row [-]; a part of 1/8 cell has a line
 LINES = 8
@@ -76,10 +76,7 @@ def _crossings(triangles: Rows, axis: int, place: Floats) -> Rows:
                 w = (p[b] - y) * (q[c] - z) - (p[c] - z) * (q[b] - y)
                 height = (u * p[axis] + v * q[axis] + w * r[axis]) / (u + v + w)
                 if -ROUNDING <= height <= 1.0 + ROUNDING:
-                    if n == len(crossings):
-                        larger = np.empty((2 * n, 4))
-                        larger[:n] = crossings
-                        crossings = larger
+                    crossings = grown(crossings, n)
                     crossings[n, 0], crossings[n, 1] = i * LINES + j, min(max(height, 0.0), 1.0)
                     crossings[n, 2], crossings[n, 3] = LEAVES if left else ENTERS, t
                     n += 1

@@ -7,8 +7,6 @@ The boundary cells of a column (i, j) leave gaps between them, and each gap is i
 a whole. So the memory follows the boundary, not the bounding box. Each rank has a slab of planes i.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from msmpetsc.backend.arrays import Array, Indices, Rows
@@ -122,22 +120,6 @@ def touched_cells(corners: Rows, low: Indices, high: Indices) -> tuple[Indices, 
                     touching[used, 1] = number
                     used += 1
     return touching[:used, 0].copy(), touching[:used, 1].copy()
-
-
-class Slab(NamedTuple):
-    """The planes first <= i < last of a rank."""
-
-    first: int
-    last: int
-
-
-def slab_edges(ranks: int, planes: int) -> Indices:
-    """Return the first plane of each rank's slab and the end of the last slab, (ranks + 1,).
-
-    If there are more ranks than planes, the last ranks have no planes.
-    """
-    used = min(ranks, planes)
-    return planes * np.minimum(np.arange(ranks + 1), used) // used
 
 
 def cells_of_gaps(gaps: Indices) -> Indices:

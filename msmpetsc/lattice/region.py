@@ -24,7 +24,6 @@ from msmpetsc.geometry.embedding import cells_at
 from msmpetsc.geometry.inside import EDGE, inside_bodies
 from msmpetsc.geometry.morton import COPIES, encode_morton
 from msmpetsc.geometry.surface import Surface, bounds_of, examine, is_inside
-from msmpetsc.geometry.valid_cells import Slab
 from msmpetsc.lattice.cell_samples import COUNT, CellSamples
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.nearest_points import NodePoints, nearest_in_bodies
@@ -201,7 +200,7 @@ class Finder:
             grid = self.cages.grids.grids[number]
             # A node is nearest to the points of the cell centred at the node.
             corners = grid.to_cells(surface.points)[surface.triangles] + are_nodes / 2
-            marked = marked_cells(corners, grid.shape + 1, Slab(0, grid.shape[0] + 1))
+            marked = marked_cells(corners, np.zeros(3, np.int64), grid.shape + 1)
             yield number, surface, encode_morton(marked + self.cages.grids.first(number))
 
     def _painted_cells(self, table: OfBody) -> Indices:

@@ -16,8 +16,6 @@ from zipfile import BadZipFile
 
 import numpy as np
 import pooch
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from msmpetsc.backend.arrays import Indices
 from msmpetsc.comm import log
@@ -329,9 +327,9 @@ def cached(step: Step, surface: Surface, *values: object) -> Surface:
 
 def part_labels(surface: Surface) -> Indices:
     """Return the number (f,) of the connected part of each triangle; equal positions connect."""
-    triangles = first_of_equal(surface.points)[surface.triangles]
-    links = triangles[:, [0, 1, 1, 2]].reshape(-1, 2).T
-    n = len(surface.points)
-    _, labels = connected_components(coo_array((np.ones(len(links[0])), links), shape=(n, n)))
-    parts: Indices = np.unique(labels[triangles[:, 0]], return_inverse=True)[1]
+    import igl
+
+    corners = first_of_equal(surface.points)[surface.triangles]
+    labels = igl.vertex_components(corners)[corners[:, 0]]
+    parts: Indices = np.unique(labels, return_inverse=True)[1]
     return parts

@@ -82,8 +82,6 @@ def _check_arrays(path: Path, points: Positions, triangles: Indices) -> None:
 def _kind(path: Path) -> str:
     """Return the format by a file's ending. Raises InputError if it is not read, or no file."""
     kind = path.suffix.lower().removeprefix(".")
-    if path.exists() and not path.is_file():
-        raise InputError(f"{path}: is a folder, a pipe or a device, not a mesh file")
     if kind not in _READERS:
         raise InputError(f"{path}: not a mesh format that is read here ({', '.join(_READERS)})")
     return kind

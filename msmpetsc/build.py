@@ -179,7 +179,8 @@ class Geometry:
         """
         if not self.cages.is_weighted:
             return None
-        return np.linalg.norm(nodes - self.nearest.points, axis=1)
+        distance: Floats = np.linalg.norm(nodes - self.nearest.points, axis=1)
+        return distance
 
 
 def build_model(

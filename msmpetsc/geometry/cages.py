@@ -19,7 +19,7 @@ from msmpetsc.geometry.copies import NO_COPIES, Copies, find_copies
 from msmpetsc.geometry.fill_fractions import LEAK, OUTSIDE, Columns, sampled_inside
 from msmpetsc.geometry.grid import CHUNK, CORNERS, BodyGrids, Grid, packed, unpacked
 from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
-from msmpetsc.geometry.partition import SortedKeys, ranges
+from msmpetsc.geometry.partition import SortedKeys, places_of, ranges
 from msmpetsc.geometry.parts_of_points import PartsOfPoints
 from msmpetsc.geometry.surface import Surface, SurfaceReport, is_inside
 from msmpetsc.geometry.thickness import Thickness
@@ -166,16 +166,15 @@ def _parts_of_all(
 ) -> list[CellParts | None]:
     """Return the parts of each closed and weighted body on rank 0, None elsewhere (collective)."""
 
-    of_parts: list[CellParts | None] = [None] * len(bodies)
+    def of_root() -> list[CellParts | None]:
+        return [
+            parts_of(body.surface, grid, _axes(body), body.report.volume)
+            if body.surface and cells.columns
+            else None
+            for body, grid, cells in zip(bodies, grids.grids, slabs, strict=True)
+        ]
 
-    def of_root() -> None:
-        for number, (body, grid, cells) in enumerate(zip(bodies, grids.grids, slabs, strict=True)):
-            if body.surface and cells.columns:
-                volume = body.report.volume
-                of_parts[number] = parts_of(body.surface, grid, _axes(body), volume)
-
-    on_root(bodies[0].comm, of_root)
-    return of_parts
+    return on_root(bodies[0].comm, of_root) or [None] * len(bodies)
 
 
 def _with_copies(
@@ -206,10 +205,9 @@ def _with_copies(
 
     of_key, copy, shares, spread = comm.bcast(on_root(comm, of_root))
     order = np.argsort(keys)
-    place = np.searchsorted(keys, of_key, sorter=order)
-    cell = np.append(order, 0)[place]
-    own = np.append(keys, -1)[np.append(order, len(keys))[place]] == of_key
-    cell, copy = cell[own], copy[own]
+    place = places_of(keys[order], of_key)
+    own = place >= 0
+    cell, copy = order[place[own]], copy[own]
     kind, fills, moments = columns
     of_copies = _clipped(fills[cell] * shares[own], moments[cell] * spread[own])
     kept = np.ones(len(keys), bool)

@@ -74,11 +74,7 @@ class Columns:
         starts = range(0, max(1, len(triangles)), CHUNK)
         pieces = (_pieces(triangles[start : start + CHUNK], low, high) for start in starts)
         parts = [_sums_of_keys(packed(cells), values) for cells, values in pieces]
-        keys = np.unique(np.concatenate([of_part for of_part, _ in parts]))
-        sums = np.zeros((len(keys), SUMS))
-        # each part has distinct keys
-        for of_part, values in parts:
-            sums[np.searchsorted(keys, of_part)] += values
+        keys, sums = _sums_of_keys(*map(np.concatenate, zip(*parts, strict=True)))
         above = _sums_above(keys // LIMIT, sums[:, :SEEN])
         below = 4 * above[:, :4].reshape(-1, 2, 2)
         above -= sums[:, :SEEN]

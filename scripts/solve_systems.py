@@ -20,21 +20,15 @@ OURS, COLUMNS = "our multigrid", ("ksp_its", "time_setup", "time_frame", "status
 USUAL = "-ksp_type cg -ksp_rtol 1e-8 -ksp_norm_type unpreconditioned -ksp_max_it 5000 "
 
 
-def read(path, *objects, comm=PETSc.COMM_WORLD):
-    viewer = PETSc.Viewer().createBinary(str(path), "r", comm)
-    return [each.create(comm).load(viewer) for each in objects]
+def read(path, *objects):
+    viewer = PETSc.Viewer().createBinary(str(path), "r", PETSc.COMM_WORLD)
+    return [each.create(PETSc.COMM_WORLD).load(viewer) for each in objects]
 
 
 def solve(folder, options):
     """Return iterations, times, whether it converged, and the error of the correction [-]."""
     PETSc.Options().insertString(USUAL + options)
     (matrix,) = read(folder / "hessian.bin", PETSc.Mat())
-    if "bddc" in options:
-        own = folder / f"subdomain_{PETSc.COMM_WORLD.rank}.bin"
-        part, rows = read(own, PETSc.Mat(), PETSc.IS(), comm=PETSc.COMM_SELF)
-        matrix = PETSc.Mat().createIS(matrix.getSizes(), *[PETSc.LGMap().create(rows.indices)] * 2)
-        matrix.setISLocalMat(part)
-        matrix.assemble()
     f, exact = (read(folder / f"{n}.bin", PETSc.Vec())[0] for n in ("residual", "correction"))
     modes = read(folder / "rigid_modes.bin", *(PETSc.Vec() for _ in range(6)))
     matrix.setNearNullSpace(PETSc.NullSpace().create(vectors=modes))

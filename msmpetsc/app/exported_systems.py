@@ -11,9 +11,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import to_host
-from msmpetsc.comm import log, on_root, together
+from msmpetsc.comm import log, on_root
 from msmpetsc.results.disk import plain_errors, write_whole
-from msmpetsc.solve.linear.assembled_hessian import assembled, blocks_of, subdomain
+from msmpetsc.solve.linear.assembled_hessian import assembled, blocks_of
 from msmpetsc.solve.linear.operators import python_matrix
 from msmpetsc.solve.nonlinear.functional import Iterate
 from msmpetsc.solve.nonlinear.jacobian import Jacobian
@@ -28,7 +28,6 @@ class ExportedSystems:
 
     A folder step_N gets hessian.bin, residual.bin, coordinates.bin, rigid_modes.bin (six
     vectors), correction.bin and system.json. Rows are by node: x, y and z of a node in sequence.
-    On several ranks, subdomain_R.bin has the part of rank R and its rows.
 
     steps : numbers of the steps, from 1, that are not written yet
 
@@ -46,8 +45,7 @@ class ExportedSystems:
         self.steps.remove(step)
         folder, unknowns = self.folder / f"step_{step}", jacobian.unknowns
         on_root(self.comm, lambda: _make(folder))
-        blocks = blocks_of(jacobian.hessian)
-        matrix = assembled(unknowns, blocks)
+        matrix = assembled(unknowns, blocks_of(jacobian.hessian))
         right, coordinates, correction = (matrix.createVecLeft() for _ in range(3))
         y = now.x.duplicate()
         cost = _solved(now, jacobian, y)
@@ -64,19 +62,9 @@ class ExportedSystems:
         }
         for name, objects in files.items():
             _write(self.comm, folder / f"{name}.bin", objects)
-        # The surface's contact with itself is no sum over the ranks' subdomains
-        has_subdomains = self.comm.size > 1 and jacobian.hessian.surface is None
-        if has_subdomains:
-            with together(self.comm):
-                _write(MPI.COMM_SELF, folder / f"subdomain_{self.comm.rank}.bin", subdomain(blocks))
         nonzeros = int(matrix.getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)["nz_used"])
-        sizes: dict[str, Any] = {
-            "step": step,
-            "nodes": unknowns.total,
-            "nonzeros": nonzeros,
-        }
-        sizes |= {"ranks": self.comm.size, "subdomains": has_subdomains}
-        facts = json.dumps(sizes | {"multigrid": cost}, indent=1)
+        sizes = {"step": step, "nodes": unknowns.total, "nonzeros": nonzeros}
+        facts = json.dumps(sizes | {"ranks": self.comm.size, "multigrid": cost}, indent=1)
         on_root(self.comm, lambda: write_whole(folder / "system.json", facts + "\n"))
         for owned in (rigid, matrix, right, coordinates, correction, y):
             owned.destroy()

@@ -10,7 +10,6 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import csr_array, diags_array, eye_array, kron
 
@@ -58,31 +57,12 @@ def assembled(unknowns: Unknowns, blocks: HessianBlocks) -> PETSc.Mat:
     Raises InputError if the nonzeros exceed PETSc's integers.
     """
     refuse_nonzeros(unknowns.comm, blocks.values.size)
-    return _summed(unknowns.comm, (3 * unknowns.size, 3 * unknowns.total), blocks)
-
-
-def subdomain(blocks: HessianBlocks) -> tuple[PETSc.Mat, PETSc.IS]:
-    """Return the sum of this rank's blocks alone, and the global numbers of its rows.
-
-    The sum over the ranks is the Hessian: BDDC needs the summands. A summand has no Dirichlet
-    condition at the border to other ranks.
-    """
-    ends = np.stack([blocks.first, blocks.second])
-    nodes, places = np.unique(ends, return_inverse=True)
-    first, second = places.reshape(ends.shape)
-    size = 3 * len(nodes)
-    matrix = _summed(PETSc.COMM_SELF, (size, size), HessianBlocks(first, second, blocks.values))
-    return matrix, PETSc.IS().createBlock(3, nodes.astype(PETSc.IntType), PETSc.COMM_SELF)
-
-
-def _summed(comm: MPI.Comm, size: tuple[int, int], blocks: HessianBlocks) -> PETSc.Mat:
-    """Return the sum of blocks as a matrix whose rows and columns have this size."""
     row, column = np.arange(3)[:, None], np.arange(3)
     rows, columns = np.broadcast_arrays(
         3 * blocks.first[:, None, None] + row, 3 * blocks.second[:, None, None] + column
     )
-    matrix = PETSc.Mat().create(comm=comm)
-    matrix.setSizes((size, size), bsize=3)
+    matrix = PETSc.Mat().create(comm=unknowns.comm)
+    matrix.setSizes(2 * ((3 * unknowns.size, 3 * unknowns.total),), bsize=3)
     matrix.setType(PETSc.Mat.Type.AIJ)
     preallocate_coo(matrix, rows.ravel(), columns.ravel())
     set_values_coo(matrix, blocks.values.ravel())

@@ -20,6 +20,7 @@ from msmpetsc.solve.linear.operators import (
 )
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import (
+    MASSLESS,
     MULTIGRID,
     STIFF,
     LatticePreconditioner,
@@ -81,11 +82,11 @@ class Jacobian:
         )
 
     def _is_stiff(self) -> bool:
-        """Return whether multigrid takes less time than Jacobi's."""
+        """Return whether multigrid takes less time than Jacobi's, and rounding keeps the mass."""
         unknowns, mass = self.unknowns, self.unknowns.lattice.mass[self.unknowns.free]
         inertia = unknowns.inertia[unknowns.free]
         ratio = self.comm.allreduce(greatest((self.diagonal - inertia) / mass), MPI.MAX)
-        return bool(ratio > STIFF)
+        return bool(ratio > STIFF and (unknowns.has_fixed or ratio < MASSLESS))
 
     def multigrid(self) -> LatticePreconditioner:
         """Return a new multigrid preconditioner of the Hessian."""

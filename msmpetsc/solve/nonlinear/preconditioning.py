@@ -24,6 +24,9 @@ MULTIGRID = PETSc.PC.Type.MG
 DIRECT = {PETSc.PC.Type.CHOLESKY, PETSc.PC.Type.LU}
 # Greatest t^2 k / m of a node; beyond it multigrid takes less time than Jacobi's
 STIFF = 15.0
+# t^2 k / m beyond which rounding hides M in H; only M resists translations of a free
+# body
+MASSLESS = 1e9
 # Iterations that cost as much as a new hierarchy
 WORTH = 10.0
 # Iterations per digit that the first hierarchy, of the rest shape, may take

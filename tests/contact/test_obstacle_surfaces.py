@@ -263,4 +263,4 @@ def test_what_cannot_be_is_refused(tmp_path: Path, changes: dict, expected: str)
 def test_explicit_steps_refuse_it(tmp_path: Path):
     time = {"step": 0.02, "duration": 0.2, "integrator": "verlet"}
     scene = fine_block(tmp_path, time=time, obstacle=[FLOOR])
-    assert 'obstacle: with response = "barrier"' in input_error(lambda: load_scene(scene))
+    assert 'obstacle: response = "barrier" is for' in input_error(lambda: load_scene(scene))

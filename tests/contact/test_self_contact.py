@@ -249,7 +249,7 @@ def test_a_surface_that_cuts_itself_all_over_is_refused(tmp_path):
         ('time.integrator="static"', "is for time.integrator"),
         (
             'obstacle=[{shape="plane", point=[0,0,-1], normal=[0,0,1], response="exchange"}]',
-            "past each other",
+            "surface contact",
         ),
         ("self_contact.distance=0", "self_contact.distance"),
         ("self_contact.friction=-1", "self_contact.friction"),

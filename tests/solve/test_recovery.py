@@ -235,12 +235,11 @@ def test_a_mirrored_body_stays_mirrored():
     )
 
 
-@pytest.mark.parametrize("name", ["squeezed far", "pressed"])
-def test_cells_that_went_through_each_other_stay_so_under_hookes_law(name: str, petsc_options):
-    """At rest, without a spring strained much, some cells inside out. As solids both come back;
-    with multigrid the first does so anyway."""
+def test_cells_that_went_through_each_other_stay_so_under_hookes_law(petsc_options):
+    """At rest, without a spring strained much, some cells inside out. As a solid the body comes
+    back."""
     petsc_options(pc_type="jacobi")
-    played = play.__wrapped__(name)
+    played = play.__wrapped__("pressed")
     assert 0 < played.inverted(played.last) < len(played.lattice.cells)
     assert (
         played.last.elastic < 1e-4 * max(frame.elastic for frame in played.frames)

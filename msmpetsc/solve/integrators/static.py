@@ -157,7 +157,11 @@ class Static(ImplicitEuler):
 
     def _first_tau(self) -> float:
         """Return SLENDER times the travel time [s] of sound along the longest side (collective)."""
-        return SLENDER * time_of_sound(self.environment.lattice)
+        lattice = self.environment.lattice
+        cells = lattice.longest_side() / lattice.cell_size
+        sums = np.array([float(lattice.mass.sum()), _stiffness(lattice)])
+        mass, stiffness = self.comm.allreduce(sums)
+        return SLENDER * float(cells * np.sqrt(mass / max(stiffness, np.finfo(float).tiny)))
 
     def set_up(self) -> None:
         """Choose tau and build the preconditioner.
@@ -229,12 +233,12 @@ def _rigid_rank(unknowns: Unknowns, fixed: Mask) -> int:
     return int(np.linalg.matrix_rank(rows))
 
 
-def time_of_sound(lattice: Lattice) -> float:
-    """Return the travel time [s] of sound, of speed sqrt(E / density), along the longest side."""
-    stiffness = float(lattice.cell_stiffness[: lattice.cells_owned].sum())
-    mass, edges = lattice.table.comm.allreduce(np.array([float(lattice.mass.sum()), stiffness]))
-    # An edge has the stiffness 4/7 E h (lattice.material)
-    return lattice.longest_side() / lattice.cell_size * float(np.sqrt(4 / 7 * mass / edges))
+def _stiffness(lattice: Lattice) -> float:
+    """Return the sum of the stiffnesses [N/m] of this rank's springs, or of the springs of L."""
+    if lattice.solid is None:
+        return float(lattice.stiffness[: lattice.springs_owned].sum())
+    bounds = lattice.solid.bounds[: lattice.cells_owned]
+    return float(4 / 3 * bounds.sum() / lattice.cell_size**2)
 
 
 def refuse_free_bodies(unknowns: Unknowns) -> None:

@@ -1,12 +1,13 @@
 """Lay out a result file, and transfer distributed rows between the file and the ranks.
 
 All metadata is written before the first frame and then does not change, so a killed run leaves a
-readable file. Every dataset of ``/frames`` and ``/checkpoint`` has its planned length and its place
-in the file from the start.
+readable file. Every dataset of ``/frames`` and ``/checkpoint`` has its planned length from the
+start, its chunks are allocated, and nothing is buffered.
 
 Rank 0, which has the file open, transfers the rows of one rank after another. Alternatively each
-rank writes its own rows straight to their bytes. This needs no parallel h5py. As nothing is
-collective, no rank waits for a rank that has failed.
+rank writes its own rows straight to their bytes: uncompressed chunks stay at the offsets that HDF5
+gave them at the start. This needs no parallel h5py. As nothing is collective, no rank waits for
+a rank that has failed.
 """
 
 import math
@@ -14,7 +15,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -26,6 +27,8 @@ from msmpetsc.errors import InputError
 from msmpetsc.fields import DIMENSIONS, FIELDS, FRAME_FIELDS, LABELS, RANKS_SHARE, unit_of
 from msmpetsc.results.disk import Storage
 
+# largest size of a chunk [byte]; bounds the memory of a reader
+CHUNK_BYTES = 64 * 2**20
 # netCDF-4's name of a dimension scale without coordinates
 LENGTH_ALONE = "This is a netCDF dimension but not a netCDF variable."
 
@@ -34,14 +37,24 @@ def open_to_write(storage: Storage, mode: str) -> h5py.File:
     """Open a new file ("w") or an existing file ("r+") so that a kill leaves it readable.
 
     The superblock of libver "earliest" has no flag "open for writing", which would lock the file of
-    a killed run. Without a lock other programs can read a running result.
+    a killed run. Without a chunk cache nothing waits to be written. Without a lock other programs
+    can read a running result.
     """
-    return h5py.File(storage, mode, libver="earliest", locking=False)
+    return h5py.File(storage, mode, libver="earliest", rdcc_nbytes=0, locking=False)
 
 
 def is_distributed(name: str) -> bool:
     """Return whether a field of frames is distributed over the ranks."""
     return bool(RANKS_SHARE.intersection(FRAME_FIELDS[name].shape))
+
+
+class Plan(NamedTuple):
+    """A planned dataset: its name, shape, chunk shape and type."""
+
+    name: str
+    shape: tuple[int, ...]
+    chunks: tuple[int, ...]
+    dtype: str
 
 
 @dataclass(frozen=True)
@@ -61,39 +74,43 @@ class Layout:
     rows: dict[str, tuple[int, ...]]
     numbers: tuple[str, ...]
 
-    def plans(self) -> Iterator[tuple[str, tuple[int, ...]]]:
-        """Yield name and shape of each dataset."""
+    def plans(self) -> Iterator[Plan]:
+        """Yield the datasets in the order in which they are created."""
         counts = {"position": self.nodes, **self.optional}
-        for name, about in FRAME_FIELDS.items():
-            sizes = about.shape[1:]
-            if name in counts or not any(isinstance(size, str) for size in sizes):
-                rows = (size if isinstance(size, int) else counts[name] for size in sizes)
-                yield f"frames/{name}", (self.frames, *rows)
-        yield "checkpoint/step", (2,)
+        for name, about in sorted(FRAME_FIELDS.items(), key=lambda item: is_distributed(item[0])):
+            if name not in counts and any(isinstance(size, str) for size in about.shape[1:]):
+                continue
+            shape = tuple(
+                size if isinstance(size, int) else counts[name] for size in about.shape[1:]
+            )
+            if is_distributed(name):
+                yield _rows_plan(f"frames/{name}", self.frames, shape[0], shape[1:], about.dtype)
+            else:
+                yield Plan(
+                    f"frames/{name}", (self.frames, *shape), (self.frames, *shape), about.dtype
+                )
+        yield Plan("checkpoint/step", (2,), (2,), FIELDS["checkpoint/step"].dtype)
         if self.numbers:
-            yield "checkpoint/numbers", (2, len(self.numbers))
+            count = len(self.numbers)
+            yield Plan(
+                "checkpoint/numbers", (2, count), (1, count), FIELDS["checkpoint/numbers"].dtype
+            )
         for name, shape in self.rows.items():
-            yield f"checkpoint/{name}", (2, self.nodes, *shape)
+            yield _rows_plan(f"checkpoint/{name}", 2, self.nodes, shape, "f8")
 
     @property
     def nbytes(self) -> int:
         """Size of all datasets [byte]."""
-        return sum(math.prod(shape) * dtype_of(name).itemsize for name, shape in self.plans())
+        return sum(math.prod(plan.shape) * np.dtype(plan.dtype).itemsize for plan in self.plans())
 
     def create(self, file: h5py.File) -> None:
         """Create all datasets in a new file, without a finished frame or checkpoint."""
         for name in ("frames", "checkpoint"):
             file.create_group(name)
-        for name, shape in self.plans():
-            dcpl = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-            dcpl.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
-            dcpl.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
-            # without times the same run writes the same bytes
-            options: dict[str, Any] = dict(dcpl=dcpl, track_times=False)
-            dataset = file.create_dataset(name, shape, dtype_of(name), **options)
-            dataset.attrs["units"] = unit_of(name)
-            if name.startswith("frames/"):
-                _name_axes(file["frames"], name.removeprefix("frames/"))
+        for plan in self.plans():
+            _plan_dataset(file, plan)
+            if plan.name.startswith("frames/"):
+                _name_axes(file["frames"], plan.name.removeprefix("frames/"))
         file["frames/time"][...] = np.nan
         file["checkpoint/step"][...] = -1
         if self.numbers:
@@ -101,20 +118,36 @@ class Layout:
 
     def first_misfit(self, file: h5py.File) -> str | None:
         """Return the first dataset that a file lacks or has in another form; None if all fit."""
-        for name, shape in self.plans():
-            dataset = file.get(name)
-            # version 0.2 and earlier wrote chunks, without a single place in the file
-            if dataset is None or dataset.shape != shape or dataset.chunks:
-                return name
-            if dataset.dtype != dtype_of(name):
-                return name
+        for plan in self.plans():
+            dataset = file.get(plan.name)
+            if (
+                dataset is None
+                or dataset.shape != plan.shape
+                or dataset.dtype != np.dtype(plan.dtype)
+            ):
+                return plan.name
         names = file["checkpoint/numbers"].attrs["names"] if self.numbers else ""
         return None if names == " ".join(self.numbers) else "checkpoint/numbers"
 
 
-def dtype_of(name: str) -> np.dtype[Any]:
-    """Return the type of a dataset; rows of a checkpoint that an integrator names are f8."""
-    return np.dtype(FIELDS[name].dtype if name in FIELDS else "f8")
+def _rows_plan(name: str, times: int, rows: int, shape: tuple[int, ...], dtype: str) -> Plan:
+    """Return the plan of a dataset (times, rows, *shape), each chunk with rows of a single time."""
+    most = CHUNK_BYTES // (math.prod(shape) * np.dtype(dtype).itemsize)
+    return Plan(name, (times, rows, *shape), (1, min(max(1, rows), most), *shape), dtype)
+
+
+def _plan_dataset(file: h5py.File, plan: Plan) -> None:
+    """Create a dataset with all its space allocated and nothing written."""
+    dcpl = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    dcpl.set_chunk(plan.chunks)
+    dcpl.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+    dcpl.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+    # without times the same run writes the same bytes
+    dcpl.set_obj_track_times(False)
+    space = h5py.h5s.create_simple(plan.shape, plan.shape)
+    kind = h5py.h5t.py_create(np.dtype(plan.dtype))
+    h5py.h5d.create(file.id, plan.name.encode(), kind, space, dcpl)
+    file[plan.name].attrs["units"] = unit_of(plan.name)
 
 
 def _name_axes(frames: h5py.Group, name: str) -> None:
@@ -213,13 +246,32 @@ def open_on_all_ranks(comm: MPI.Comm, path: Path) -> int | None:
     return None
 
 
-def write_bytes(file: int, rows: Array, offset: int) -> None:
-    """Write contiguous rows (n, ...) at an offset [byte] in a file, by its descriptor.
+def chunk_offsets(dataset: h5py.Dataset, index: int) -> list[int]:
+    """Return the byte offsets in the file of the chunks of dataset[index], in row order."""
+    starts = range(0, dataset.shape[1], dataset.chunks[1])
+    rest = (0,) * (dataset.ndim - 2)
+    return [
+        dataset.id.get_chunk_info_by_coord((index, start, *rest)).byte_offset for start in starts
+    ]
 
-    Raises OSError.
+
+def write_bytes(file: int, rows: Array, start: int, chunk: int, offsets: Sequence[int]) -> None:
+    """Write contiguous rows (n, ...) at their byte offsets in a file. Raises OSError.
+
+    file    : descriptor of the file
+    start   : number of the first row in its dataset
+    chunk   : rows in a chunk
+    offsets : offsets of the chunks [byte]
     """
-    data = rows.ravel().view(np.uint8).data
-    while data:
-        written = os.pwrite(file, data, offset)
-        data = data[written:]
-        offset += written
+    row_bytes = rows.dtype.itemsize * math.prod(rows.shape[1:])
+    done = 0
+    while done < len(rows):
+        number, within = divmod(start + done, chunk)
+        count = min(chunk - within, len(rows) - done)
+        data = rows[done : done + count].data.cast("B")
+        offset = offsets[number] + within * row_bytes
+        while data:
+            written = os.pwrite(file, data, offset)
+            data = data[written:]
+            offset += written
+        done += count

@@ -34,12 +34,13 @@ def open_result(path: str | Path) -> h5py.File:
         path.open("rb").close()
         if not h5py.is_hdf5(path):
             raise InputError(f"{path} is not an HDF5 file")
+        # no chunk cache: a run may be writing the file
         try:
             # the default locking: HDF5 opens a file twice only with the same locking
-            file = h5py.File(path, "r")
+            file = h5py.File(path, "r", rdcc_nbytes=0)
         except OSError:
             # the file system has no locks, or another process holds a lock
-            file = h5py.File(path, "r", locking=False)
+            file = h5py.File(path, "r", rdcc_nbytes=0, locking=False)
     try:
         with plain_damage(path):
             _check_is_result(path, file)

@@ -10,7 +10,6 @@ metadata does not change either. Otherwise the run writes a new file, copies the
 renames it when they are complete (`Begin`).
 """
 
-import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
@@ -39,6 +38,7 @@ from msmpetsc.results.disk import (
 )
 from msmpetsc.results.layout import (
     Layout,
+    chunk_offsets,
     gather_rows,
     is_distributed,
     open_on_all_ranks,
@@ -382,13 +382,14 @@ class ResultFile:
         self, descriptor: int, rows: Array, counts: Sequence[int], name: str, index: int
     ) -> None:
         """Write each rank's rows to their bytes in row `index` of dataset `name` (collective)."""
-        # none of a dataset without rows
-        place = self._file[name].id.get_offset() if self._file is not None else None
-        place = self._comm.bcast(place) or 0
-        first = index * sum(counts) + sum(counts[: self._comm.rank])
-        row_bytes = rows.dtype.itemsize * math.prod(rows.shape[1:])
+        chunk, offsets = 0, []
         with self._together():
-            write_bytes(descriptor, rows, place + first * row_bytes)
+            if self._file is not None:
+                dataset = self._file[name]
+                chunk, offsets = dataset.chunks[1], chunk_offsets(dataset, index)
+        chunk, offsets = self._comm.bcast((chunk, offsets))
+        with self._together():
+            write_bytes(descriptor, rows, sum(counts[: self._comm.rank]), chunk, offsets)
 
 
 def write_model(comm: MPI.Intracomm, file: ResultFile, model: Model) -> None:

@@ -11,7 +11,7 @@ from mpi4py import MPI
 from msmpetsc.checkpoint import Checkpoint
 from msmpetsc.errors import InputError
 from msmpetsc.fields import Frame
-from msmpetsc.results import writer
+from msmpetsc.results import layout, writer
 from msmpetsc.results.writer import ResultFile
 
 NODES, POINTS, STEPS = 23, 17, 9
@@ -45,6 +45,8 @@ def share(rows: int) -> slice:
 
 
 def write_all(path: str) -> None:
+    # several chunks on each rank
+    layout.CHUNK_BYTES = 5 * 24
     nodes, points = share(NODES), share(POINTS)
     with ResultFile(path, MPI.COMM_WORLD, {"scene": "title = 'a test'", "ranks": 3}) as file:
         file.write("lattice/nodes", positions(0, NODES)[nodes])

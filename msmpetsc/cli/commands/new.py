@@ -6,7 +6,6 @@ its root, so that bodies of all sizes move alike.
 
 import argparse
 import json
-import os
 import tomllib
 from pathlib import Path
 from shlex import quote
@@ -18,11 +17,11 @@ from msmpetsc.app.checks import SCENE_NAMES, refuse_other_format
 from msmpetsc.build import USUAL_SIDES
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, did_you_mean
-from msmpetsc.geometry.registry import MODELS, load
+from msmpetsc.geometry.registry import MODELS, load, locate
 from msmpetsc.geometry.surface import check_encloses, examine
 from msmpetsc.results.disk import write_whole
 from msmpetsc.scene.key_table import SCHEMA_FILE, json_schema
-from msmpetsc.scene.reading import scene_of
+from msmpetsc.scene.reading import lies_below, scene_of
 
 # folder of the shipped scenes, which a wheel also has; in a clone a link to scenes/
 SHIPPED = Path(msmpetsc.__file__).parent / "shipped"
@@ -85,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         text = drafted(args.mesh, args.scene, args.up)
     # raise before writing a scene that run would refuse
-    scene_of(args.scene, text)
+    scene_of(args.scene, text, to_read=False)
     write_whole(args.scene.with_name(SCHEMA_FILE), json.dumps(json_schema(), indent=1) + "\n")
     write_whole(args.scene, text)
     print(f"{args.scene}\nto run it: msmpetsc run {quote(str(args.scene))} --picture")
@@ -97,7 +96,7 @@ def drafted(mesh: Path, scene: Path, up: str | None) -> str:
 
     up : the mesh's upward axis, "y" or "z"; None for y in glTF files and z in others
     """
-    source = str(mesh) if str(mesh) in MODELS else os.path.relpath(mesh, scene.parent)
+    source = str(mesh) if str(mesh) in MODELS else path_from(scene, mesh)
     surface = load(source, scene.parent)
     report = examine(surface)
     for warning in check_encloses(surface, report):
@@ -128,6 +127,20 @@ def drafted(mesh: Path, scene: Path, up: str | None) -> str:
         step=3e-3 * height**0.5,
         duration=0.8 * height**0.5,
     )
+
+
+def path_from(scene: Path, mesh: Path) -> str:
+    """Return the path of a mesh relative to its scene. Raises InputError for a mesh elsewhere."""
+    folder = scene.parent
+    if not mesh.exists():
+        # raises the error of a missing mesh
+        locate(str(mesh), Path())
+    if not lies_below(folder, str(mesh.resolve())):
+        raise InputError(
+            f"{mesh} is not in {folder.resolve()}, nor below it, as a scene requires: "
+            "write the scene beside its mesh"
+        )
+    return str(mesh.resolve().relative_to(folder.resolve()))
 
 
 def shipped_titles() -> dict[str, str]:

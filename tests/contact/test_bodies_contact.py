@@ -271,7 +271,7 @@ def test_a_correction_through_the_surface_says_little_of_the_error(folder: Path)
         now = functional.at(q)
         stepper.control.estimate(now)
         correction = stepper.control.estimate.correction_norm
-        outcome = Outcome(corrected=True)
+        outcome = Outcome(corrected=True, compression=optimality.curvature.compression(q))
         verdict = optimality.examine(now, outcome, correction)
     assert verdict.error > 10 * correction / functional.distance(q)
 

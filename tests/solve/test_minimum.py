@@ -131,7 +131,7 @@ def test_the_lowest_curvature_is_that_of_a_dense_matrix(
     if lowest > 0:
         assert found < lowest + 0.1
     # 0 if no curvature was computed
-    known = curvature.least(curvature.compression(q))
+    known = curvature.compression(q).least_curvature
     assert known == 0 or lowest >= known - 1e-9
     simulation.destroy()
 
@@ -161,9 +161,8 @@ def test_a_compressed_body_that_nothing_moves_is_at_rest(preset: str, shift: flo
     lattice = chain(T**2 * k * (r - 1) / 0.29, k, r)
     stepper = Stepper(MPI.COMM_SELF, lattice, T, find_preset(preset), error=1e-3)
     q = lattice.nodes + shift
-    curvature = stepper.optimality.curvature
-    compression = curvature.compression(q)
-    assert curvature.least(compression) == 0 and compression == pytest.approx(4 * 0.29)
+    compression = stepper.optimality.curvature.compression(q)
+    assert compression.least_curvature == 0 and compression.greatest == pytest.approx(4 * 0.29)
     result = stepper.step(StepProblem(q, q, np.zeros((len(q), 3))))
     stepper.destroy()
     np.testing.assert_allclose(result.position, q, atol=1e-12)

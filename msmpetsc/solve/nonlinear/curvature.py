@@ -4,9 +4,10 @@ F vanishes on a saddle of g, too, and a symmetric start never leaves the saddle.
 or cells bounds the negative parts of H. If they are small enough, H is positive definite. Otherwise
 the lowest eigenvalue of M^(-1) H is computed (nonlinear.lobpcg). A long search is made if the
 compression has grown or if a solve has met a negative curvature. At all other steps an iteration
-follows the last mode if its curvature has changed.
+follows the last mode.
 """
 
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -25,10 +26,31 @@ ALIKE = 0.9
 # Growth of the compression, or of the mode's curvature, beyond which another mode may
 # be the lowest
 MORE = 1.5
-# Relative change of the mode's curvature below which the mode is taken as it is
-UNCHANGED = 0.1
 # Directions of a search of all modes
-BLOCK = 2
+BLOCK = 3
+
+
+@dataclass(frozen=True)
+class Compression:
+    """Compression of a body: t^2 concavity / m of the free nodes of all ranks.
+
+    greatest : greatest value
+    inertia  : whether M is part of H and outweighs negative parts of the elastic Hessian
+    """
+
+    greatest: float = 0.0
+    inertia: bool = True
+
+    @property
+    def least_curvature(self) -> float:
+        """Lower bound of the eigenvalues of M^(-1) H.
+
+        0 if M may not outweigh the negative parts.
+        """
+        return max(1 - self.greatest, 0.0) if self.inertia else 0.0
+
+
+NONE = Compression()
 
 
 class LowestCurvature:
@@ -62,27 +84,19 @@ class LowestCurvature:
         # Whether the last checkpoint has the mode
         self.knows_mode = False
 
-    def compression(self, q: Positions) -> float:
-        """Return the compression at positions q (l, 3) [m] in the functional's problem.
-
-        It is the greatest t^2 concavity / m of a free node of all ranks.
-        """
+    def compression(self, q: Positions) -> Compression:
+        """Return the compression at positions q (l, 3) [m] in the functional's problem."""
         functional, free = self.functional, self.unknowns.free
-        concavity = functional.elasticity.concavity(q)[free]
+        elasticity = functional.elasticity
+        concavity = elasticity.concavity(q)[free]
         if functional.surface:
             concavity = concavity + functional.surface.concavity(q)[free]
         ratios = functional.t2 * concavity / functional.lattice.mass[free]
-        return float(self.comm.allreduce(greatest(ratios), MPI.MAX))
-
-    def least(self, compression: float) -> float:
-        """Return a lower bound of the eigenvalues of M^(-1) H.
-
-        0 if M is no part of H, or may not outweigh the negative parts.
-        """
-        return 0.0 if self.unknowns.static else max(1 - compression, 0.0)
+        most = self.comm.allreduce(greatest(ratios), MPI.MAX)
+        return Compression(most, not self.unknowns.static)
 
     def lowest(
-        self, q: Positions, compression: float, alarm: bool, hint: PETSc.Vec | None
+        self, q: Positions, compression: Compression, alarm: bool, hint: PETSc.Vec | None
     ) -> tuple[float, Floats | None]:
         """Return the lowest eigenvalue of M^(-1) H that a search finds, and its direction (n,).
 
@@ -109,15 +123,15 @@ class LowestCurvature:
         return values[0], self.mode
 
     def _lowest(
-        self, q: Positions, compression: float, alarm: bool, hint: PETSc.Vec | None
+        self, q: Positions, compression: Compression, alarm: bool, hint: PETSc.Vec | None
     ) -> tuple[Floats, Rows]:
         """Return the lowest curvatures (k,) and their modes (k, n), by a short or a long search."""
         # Another mode may be the lowest after an alarm or a greater compression
-        is_same = not alarm and compression <= MORE * self.searched
+        is_same = not alarm and compression.greatest <= MORE * self.searched
         lowest = self._followed() if is_same else None
         if lowest is None:
             # After an alarm the next step makes a long search, too
-            self.searched = 0.0 if alarm else compression
+            self.searched = 0.0 if alarm else compression.greatest
             lowest = self._long_search(q, hint)
         return lowest
 
@@ -129,10 +143,6 @@ class LowestCurvature:
         """
         if self.mode is None:
             return None
-        values, modes = self.search.lowest([self.mode[None]], 1, 0)
-        if abs(values[0] - self.value) <= UNCHANGED * self.value:
-            # The stored curvature stays, so that slow changes add up
-            return np.array([self.value]), modes
         values, modes = self.search.lowest([self.mode[None], self.search.random(1)], 2, 1)
         return None if values[0] > MORE * self.value else (values, modes)
 

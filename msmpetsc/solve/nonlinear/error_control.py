@@ -21,7 +21,7 @@ from petsc4py import PETSc
 
 from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
 from msmpetsc.errors import StepFailed
-from msmpetsc.solve.nonlinear.curvature import LowestCurvature
+from msmpetsc.solve.nonlinear.curvature import Compression, LowestCurvature
 from msmpetsc.solve.nonlinear.error_estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional
 
@@ -67,6 +67,7 @@ class Outcome:
     alarm       : whether a solve has met a negative curvature
     at_rounding : whether F is rounding alone
     doubts      : number of points found to be no minimum, or farther from it than estimated
+    compression : of the iterate; None if not yet computed
     """
 
     goal: float = 0.0
@@ -79,6 +80,7 @@ class Outcome:
     alarm: bool = False
     at_rounding: bool = False
     doubts: int = 0
+    compression: Compression | None = None
 
     @property
     def is_flat(self) -> bool:
@@ -123,6 +125,7 @@ class ErrorControl:
             at_rounding=at_rounding,
             corrected=False,
             reduction=residual / before.residual if np.isfinite(before.residual) else 1.0,
+            compression=None,
         )
         # No error is relative to the start x = y
         if not distance > 0 or not np.isfinite(residual):
@@ -131,7 +134,9 @@ class ErrorControl:
         now = replace(now, bound=bound, error=bound)
         if bound > now.goal:
             return now
-        lowest = self.curvature.least(self.curvature.compression(iterate.q))
+        now = self.with_compression(iterate, now)
+        assert now.compression is not None
+        lowest = now.compression.least_curvature
         return replace(now, error=bound / lowest if lowest > 0 else np.inf)
 
     def at_rounding(self, iterate: Iterate, now: Outcome) -> Outcome:
@@ -147,6 +152,14 @@ class ErrorControl:
         if now.error <= now.goal or not self.is_near(now):
             return now
         return self.estimated(iterate, now, now.goal)
+
+    def with_compression(self, iterate: Iterate, now: Outcome) -> Outcome:
+        """Return the outcome with the compression of its iterate."""
+        return (
+            now
+            if now.compression
+            else replace(now, compression=self.curvature.compression(iterate.q))
+        )
 
     def estimated(self, iterate: Iterate, now: Outcome, goal: float) -> Outcome:
         """Return the outcome with an estimated error.

@@ -70,11 +70,12 @@ class Optimality:
     def examine(self, at: Iterate, outcome: Outcome, acceptable: float) -> Verdict:
         """Examine g at x - e, or at x if the iterate has no correction e; return the verdict.
 
-        outcome    : of the iterate; ``corrected`` if estimate.correction is e
+        outcome    : of the iterate, with its compression; ``corrected`` if estimate.correction
+                     is e
         acceptable : acceptable error |e|_M [m sqrt(kg)]
         """
-        functional, estimate = self.functional, self.estimate
-        compression = self.curvature.compression(at.q)
+        functional, estimate, compression = self.functional, self.estimate, outcome.compression
+        assert compression is not None
         examined = self._corrected_iterate(at) if outcome.corrected else None
         corrected = examined is not None
         length = functional.norm(estimate.correction) if corrected else 0.0
@@ -84,7 +85,7 @@ class Optimality:
         # Change of F that H at the iterate does not predict
         bent = functional.dual_norm(estimate.residual)
         hint = estimate.correction if outcome.alarm else None
-        value, direction = self.curvature.least(compression), None
+        value, direction = compression.least_curvature, None
         if value <= CONVEX:
             value, direction = self.curvature.lowest(examined.q, compression, outcome.alarm, hint)
         if value < 0:

@@ -130,7 +130,8 @@ class Stepper:
                     self.functional, self.preset, self.options, self.touches, self.owned
                 )
                 self.snes, self.ksp = self._create_solvers()
-                self._create_method()
+                self.control, self.optimality = self._create_control()
+                self.method = self._create_method()
                 self.carried_start = CarriedStart(self.functional, self.jacobian, self.ksp)
         except InputError:
             self.destroy()
@@ -177,27 +178,31 @@ class Stepper:
                     "their own; presets anderson and lbfgs take it"
                 )
 
-    def _create_method(self) -> None:
+    def _create_control(self) -> tuple[ErrorControl, Optimality]:
         functional, jacobian = self.functional, self.jacobian
         hessian, preconditioner = jacobian.hessian, jacobian.preconditioner
         estimate = self._keep(ErrorEstimate(functional, hessian, preconditioner, self.prefix))
         curvature = LowestCurvature(functional, hessian, preconditioner)
         rounding = Rounding(functional, jacobian.diagonal)
-        self.optimality = Optimality(functional, estimate, curvature, rounding)
+        optimality = Optimality(functional, estimate, curvature, rounding)
         error = self.error
         if error is None and not self.budget:
             error = DEFAULT_STEP_ERROR
         rtol = self.ksp.getTolerances()[0]
-        self.control = ErrorControl(functional, estimate, curvature, rounding, error or 0.0, rtol)
+        control = ErrorControl(functional, estimate, curvature, rounding, error or 0.0, rtol)
+        return control, optimality
+
+    def _create_method(self) -> Newton | LocalGlobal:
         given = (
             self.functional, self.jacobian, self.snes, self.ksp, self.control, self.preset,
             self.options, self.budget, self.spent,
         )  # fmt: skip
         if self.preset.true_hessian:
-            self.method: Newton | LocalGlobal = Newton(*given)
-            self.snes.setPythonContext(self.method)
+            method: Newton | LocalGlobal = Newton(*given)
+            self.snes.setPythonContext(method)
         else:
-            self.method = LocalGlobal(*given, self.prefix, self.options.is_given("npc_snes_type"))
+            method = LocalGlobal(*given, self.prefix, self.options.is_given("npc_snes_type"))
+        return method
 
     def set_up(self) -> None:
         """Build the preconditioner before the first step; Cholesky factorises here.
@@ -325,9 +330,10 @@ class Stepper:
     def examine(self, now: Iterate, outcome: Outcome) -> Verdict:
         """Return whether an iterate is a minimum, and its error (collective)."""
         control = self.control
-        curvature = self.optimality.curvature
+        outcome = control.with_compression(now, outcome)
+        assert outcome.compression is not None
         # A budget may end far from the minimum
-        if not self.budget and curvature.least(curvature.compression(now.q)) > 0:
+        if outcome.compression.least_curvature > 0 and not self.budget:
             return Verdict(outcome.error, now, is_minimum=True)
         enough = control.target * self.functional.distance(now.q) if control.target else np.inf
         verdict = self.optimality.examine(now, outcome, enough)

@@ -190,12 +190,10 @@ class Newton(StepMethod):
         """
         self.adapt(outcome)
         rtol = self.ksp.getTolerances()[0]
-        self.ksp.setOperators(self.jacobian.operator)
-        # CG's first set-up allocates its singular values for the max_it of then
-        self.ksp.setUp()
         if not self.options.is_given("ksp_max_it"):
             most = self.jacobian.preconditioner.most_iterations(rtol)
             self.ksp.setTolerances(max_it=most or self.most_its)
+        self.ksp.setOperators(self.jacobian.operator)
         self.control.estimate.begin(outcome.goal * outcome.distance if tells_error else 0.0)
         self.ksp.solve(now.f, self.y)
         self.jacobian.preconditioner.learn(self.ksp.its, rtol)

@@ -34,8 +34,8 @@ from msmpetsc.results.checkpoint_reader import Earlier
 from msmpetsc.results.untrusted_file import finished
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.multigrid import cycle
-from msmpetsc.solve.multigrid.cycle import Multigrid
 from msmpetsc.solve.nonlinear import preconditioning
+from msmpetsc.solve.nonlinear.preconditioning import LatticePreconditioner
 from msmpetsc.solve.presets import PRESETS
 from msmpetsc.solve.simulate import TimeLoop
 
@@ -182,8 +182,10 @@ def test_the_hierarchy_of_then_is_built_again(tmp_path, case: str, monkeypatch):
     """In runs that build hierarchies in some steps only: of several levels, given up soon."""
     monkeypatch.setattr(cycle, "COARSEST", 10)
     monkeypatch.setattr(preconditioning, "WORTH", 1.0)
-    built, build = [], Multigrid.update
-    monkeypatch.setattr(Multigrid, "update", lambda *given: (built.append(1), build(*given))[1])
+    built, build = [], LatticePreconditioner._build
+    monkeypatch.setattr(
+        LatticePreconditioner, "_build", lambda *given: (built.append(1), build(*given))[1]
+    )
     frames = assert_goes_on_exactly(block_scene(tmp_path, **MULTIGRID[case]), every=3)
     assert len(built) > 1
     assert case != "fallback" or sum(frame.fallbacks for frame in frames) > 0

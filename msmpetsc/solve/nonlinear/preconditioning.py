@@ -12,6 +12,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Positions, Rows, like
 from msmpetsc.contact.step_contact import StepContactAt
+from msmpetsc.contact.surface.surface_contact import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.solve.linear.operators import Block
 from msmpetsc.solve.linear.unknowns import Unknowns
@@ -27,10 +28,12 @@ STIFF = 15.0
 # t^2 k / m beyond which rounding hides M in H; only M resists translations of a free
 # body
 MASSLESS = 1e9
+# Iterations per digit with a hierarchy of the present positions
+USUAL_RATE = 2.5
 # Iterations that cost as much as a new hierarchy
 WORTH = 10.0
-# Iterations per digit that the first hierarchy, of the rest shape, may take
-USUAL_RATE = 2.5
+# Iterations beyond the usual number that a solve with an old hierarchy may take
+PATIENCE = 15.0
 
 
 class StepPreconditioner:
@@ -38,9 +41,11 @@ class StepPreconditioner:
 
     All methods are collective.
 
-    pc : PETSc's preconditioner
+    is_uniform : whether smooth errors converge as fast as oscillating errors
+    pc         : PETSc's preconditioner
     """
 
+    is_uniform: bool
     unknowns: Unknowns
     pc: PETSc.PC
 
@@ -100,6 +105,8 @@ class MatrixPreconditioner(StepPreconditioner):
     own     : (m,) diagonal of A, of this rank [kg]
     added   : (m,) addition to the diagonal, over t^2 [N/m]
     """
+
+    is_uniform = False
 
     def __init__(
         self, matrix: PETSc.Mat, unknowns: Unknowns, prefix: str, time_step: float, touches: bool
@@ -164,7 +171,10 @@ class LatticePreconditioner(StepPreconditioner):
     rate         : iterations per digit of the first solve with the hierarchy; None before it
     excess       : iterations above this rate since then
     is_stale     : whether a new hierarchy is due
+    is_new       : whether the hierarchy was built at the positions of the next linear solve
     """
+
+    is_uniform = True
 
     def __init__(self, unknowns: Unknowns, elasticity: Elasticity, time_step: float, prefix: str):
         self.unknowns = unknowns
@@ -173,9 +183,10 @@ class LatticePreconditioner(StepPreconditioner):
         self.matrix, self.pc = self.multigrid.operator, self.multigrid.pc
         bodies = self.multigrid.bodies
         self.translations = Translations(unknowns, bodies) if bodies.free.any() else None
+        self.is_first = True
         self.rate: float | None = None
         self.excess = 0.0
-        self.is_first, self.is_stale, self.is_free = True, True, False
+        self.is_stale, self.is_new, self.is_free = True, False, False
 
     @property
     def products(self) -> int:
@@ -187,16 +198,13 @@ class LatticePreconditioner(StepPreconditioner):
         A kept hierarchy follows the contact of single nodes: a node that has come into contact
         costs several iterations.
         """
-        self.is_free = self._is_free(q, contact)
-        if not self.is_stale:
-            follows = contact is not None and not contact.surface
-            return follows and self._follow(self._blocks(contact))
-        surface = contact.surface.hessian(q, True) if contact and contact.surface else None
-        with HIERARCHY:
-            self.multigrid.update(q.copy(), self._blocks(contact), surface)
-        self.rate = USUAL_RATE if self.is_first else None
-        self.excess, self.is_first, self.is_stale = 0.0, False, False
-        return True
+        self.is_free, self.is_new = self._is_free(q, contact), self.is_stale
+        if self.is_new:
+            surface = contact.surface.hessian(q, True) if contact and contact.surface else None
+            self._build(q.copy(), self._blocks(contact), surface)
+        elif contact and not contact.surface:
+            return self._follow(self._blocks(contact))
+        return self.is_new
 
     def _follow(self, contact: Rows) -> bool:
         """Give the hierarchy the present contact (owned, 9) [N/m]; return whether it changed."""
@@ -210,11 +218,13 @@ class LatticePreconditioner(StepPreconditioner):
     def most_iterations(self, rtol: float) -> int | None:
         """Return the most iterations of a solve to a relative tolerance with this hierarchy.
 
-        A longer solve needs a new hierarchy. Return None for a hierarchy of the present positions.
+        Return None for a hierarchy of the present positions.
         """
-        if self.rate is None:
-            return None
-        return int(self.rate * _digits(rtol) + WORTH - self.excess) + 1
+        return (
+            None
+            if self.is_new or self.rate is None
+            else int(self.rate * _digits(rtol) + PATIENCE - self.excess)
+        )
 
     def learn(self, its: int, rtol: float) -> None:
         """Count the iterations of a linear solve to a relative tolerance.
@@ -229,6 +239,15 @@ class LatticePreconditioner(StepPreconditioner):
             self.rate = its / digits
         self.excess += max(its - self.rate * digits, 0.0)
         self.is_stale |= self.excess > WORTH
+
+    def _build(self, q: Positions, contact: Rows, surface: SurfaceHessian | None) -> None:
+        with HIERARCHY:
+            self.multigrid.update(q, contact, surface)
+        self.rate = None
+        if self.is_first:
+            self.rate = USUAL_RATE
+        self.excess = 0.0
+        self.is_first = self.is_stale = False
 
     def _is_free(self, q: Positions, contact: StepContactAt | None) -> bool:
         """Return whether no obstacle presses on a node at positions q (l, 3) [m].

@@ -136,7 +136,7 @@ DAMAGE = [
     (dangling, "lattice/cell_kind"), (a_group, "frames/surface"),
     (number(5), "LowestCurvature.knows_mode"),
     (number(np.inf), "Monitors.work.iterations"), (number(np.nan), "put_in"),
-    (number(-1), "Monitors.frames"), (number(np.nan), "LowestCurvature.searched"),
+    (number(-1), "Monitors.frames"), (number(np.nan), "LowestCurvature.searched.total"),
 ]  # fmt: skip
 
 

@@ -20,7 +20,7 @@ from mpi4py import MPI
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
-from msmpetsc.solve.nonlinear.curvature import ALIKE
+from msmpetsc.solve.nonlinear.curvature import ALIKE, Alarm
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import find_preset
@@ -121,7 +121,8 @@ def test_the_lowest_curvature_is_that_of_a_dense_matrix(
     functional.begin(StepProblem(q, q, np.zeros((len(q), 3))))
     stepper.jacobian.hessian.linearise(q, None)
     stepper.jacobian.preconditioner.prepare(q, None)
-    found, direction = curvature.lowest(q, curvature.compression(q), False, None)
+    found, direction = curvature.lowest(q, curvature.compression(q), Alarm.NOWHERE, None)
+    assert stepper.jacobian.preconditioner.is_uniform == multigrid
     dense, root = dense_hessian(stepper), np.sqrt(functional.mass)
     lowest = np.linalg.eigvalsh(dense / root / root[:, None])[0]
     # below 0 a direction is a mix of the modes that are nearly as low

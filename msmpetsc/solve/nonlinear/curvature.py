@@ -3,22 +3,30 @@
 F vanishes on a saddle of g, too, and a symmetric start never leaves the saddle. A pass over springs
 or cells bounds the negative parts of H. If they are small enough, H is positive definite. Otherwise
 the lowest eigenvalue of M^(-1) H is computed (nonlinear.lobpcg). A long search is made if the
-compression has grown or if a solve has met a negative curvature. At all other steps an iteration
-follows the last mode.
+compression has grown or if a solve has met a negative curvature. At all other steps a few
+iterations follow the last mode if its curvature has changed.
 """
 
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import ClassVar
 
 import numpy as np
-from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Floats, Positions, Rows, greatest, like, to_host
 from msmpetsc.checkpoint import ANY, Checkpoint, Range
 from msmpetsc.solve.linear.operators import TrueHessian
 from msmpetsc.solve.nonlinear.functional import StepFunctional
-from msmpetsc.solve.nonlinear.lobpcg import DEPENDENT, LONGEST_SEARCH, TINY, Lobpcg
+from msmpetsc.solve.nonlinear.lobpcg import (
+    DEPENDENT,
+    EFFORT,
+    LONGEST_SEARCH,
+    TINY,
+    UNIFORM_EFFORT,
+    Lobpcg,
+    SearchEffort,
+)
 from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 
 # Modes of at least this share of the lowest negative curvature count as equally steep
@@ -26,8 +34,16 @@ ALIKE = 0.9
 # Growth of the compression, or of the mode's curvature, beyond which another mode may
 # be the lowest
 MORE = 1.5
-# Directions of a search of all modes
-BLOCK = 3
+# Relative change of the mode's curvature below which the mode is taken as it is
+UNCHANGED = 0.1
+
+
+class Alarm(IntEnum):
+    """Place of a negative curvature that a solve has met: here, or at an earlier iterate."""
+
+    NOWHERE = 0
+    ON_THE_WAY = 1
+    HERE = 2
 
 
 @dataclass(frozen=True)
@@ -35,10 +51,12 @@ class Compression:
     """Compression of a body: t^2 concavity / m of the free nodes of all ranks.
 
     greatest : greatest value
+    total    : sum
     inertia  : whether M is part of H and outweighs negative parts of the elastic Hessian
     """
 
     greatest: float = 0.0
+    total: float = 0.0
     inertia: bool = True
 
     @property
@@ -75,14 +93,19 @@ class LowestCurvature:
         self.search = Lobpcg(functional, hessian, preconditioner)
         # Products with H (multigrid's finest level included) of all searches so far
         self.products = 0
-        # Greatest compression at which the last long search was made
-        self.searched = 0.0
+        # Compression at which the last long search was made
+        self.searched = NONE
         # Lowest known mode (n,), of unit length in the norm of M, and its curvature
         # when it was found
         self.mode: Floats | None = None
         self.value = 0.0
         # Whether the last checkpoint has the mode
         self.knows_mode = False
+
+    @property
+    def effort(self) -> SearchEffort:
+        """Effort of a search with the present preconditioner."""
+        return UNIFORM_EFFORT if self.preconditioner.is_uniform else EFFORT
 
     def compression(self, q: Positions) -> Compression:
         """Return the compression at positions q (l, 3) [m] in the functional's problem."""
@@ -92,17 +115,16 @@ class LowestCurvature:
         if functional.surface:
             concavity = concavity + functional.surface.concavity(q)[free]
         ratios = functional.t2 * concavity / functional.lattice.mass[free]
-        most = self.comm.allreduce(greatest(ratios), MPI.MAX)
-        return Compression(most, not self.unknowns.static)
+        most, sums = zip(*self.comm.allgather((greatest(ratios), float(ratios.sum()))), strict=True)
+        return Compression(max(most), sum(sums), not self.unknowns.static)
 
     def lowest(
-        self, q: Positions, compression: Compression, alarm: bool, hint: PETSc.Vec | None
+        self, q: Positions, compression: Compression, alarm: Alarm, hint: PETSc.Vec | None
     ) -> tuple[float, Floats | None]:
         """Return the lowest eigenvalue of M^(-1) H that a search finds, and its direction (n,).
 
-        q     : positions (l, 3) [m] at which H was linearised last
-        alarm : whether a solve has met a negative curvature
-        hint  : a direction that may contain the mode
+        q    : positions (l, 3) [m] at which H was linearised last
+        hint : a direction that may contain the mode
         """
         products = self.hessian.products + self.preconditioner.products
         values, modes = self._lowest(q, compression, alarm, hint)
@@ -123,16 +145,20 @@ class LowestCurvature:
         return values[0], self.mode
 
     def _lowest(
-        self, q: Positions, compression: Compression, alarm: bool, hint: PETSc.Vec | None
+        self, q: Positions, compression: Compression, alarm: Alarm, hint: PETSc.Vec | None
     ) -> tuple[Floats, Rows]:
         """Return the lowest curvatures (k,) and their modes (k, n), by a short or a long search."""
+        lowest, before = None, self.searched
+        more = (
+            compression.greatest > MORE * before.greatest or compression.total > MORE * before.total
+        )
         # Another mode may be the lowest after an alarm or a greater compression
-        is_same = not alarm and compression.greatest <= MORE * self.searched
-        lowest = self._followed() if is_same else None
+        if not (alarm or more):
+            lowest = self._followed()
         if lowest is None:
             # After an alarm the next step makes a long search, too
-            self.searched = 0.0 if alarm else compression.greatest
-            lowest = self._long_search(q, hint)
+            self.searched = NONE if alarm else compression
+            lowest = self._long_search(q, hint, EFFORT if alarm is Alarm.HERE else self.effort)
         return lowest
 
     def _followed(self) -> tuple[Floats, Rows] | None:
@@ -143,10 +169,18 @@ class LowestCurvature:
         """
         if self.mode is None:
             return None
-        values, modes = self.search.lowest([self.mode[None], self.search.random(1)], 2, 1)
+        its = self.effort.followed
+        values, modes = self.search.lowest([self.mode[None]], 1, 0, 0)
+        if abs(values[0] - self.value) <= UNCHANGED * self.value:
+            # The stored curvature stays, so that slow changes add up
+            return np.array([self.value]), modes
+        start = [self.mode[None], self.search.random(1)]
+        values, modes = self.search.lowest(start, 2, its, its)
         return None if values[0] > MORE * self.value else (values, modes)
 
-    def _long_search(self, q: Positions, hint: PETSc.Vec | None) -> tuple[Floats, Rows]:
+    def _long_search(
+        self, q: Positions, hint: PETSc.Vec | None, effort: SearchEffort
+    ) -> tuple[Floats, Rows]:
         """Return the lowest curvatures and their modes by a long search.
 
         A search from a known mode finds a lower mode late, so this search starts from random
@@ -154,15 +188,25 @@ class LowestCurvature:
         delay a lower mode in the same way, so they are left out at first. A second search starts
         from these modes, the known mode and the rigid motions.
         """
-        search, noise = self.search, self.search.random(BLOCK)
-        if hint is not None:
-            noise[0] += search.unit(self.functional.memory.read(hint)[None])[0]
+        is_uniform = effort is UNIFORM_EFFORT
+        search, block, least = self.search, effort.block, effort.least
         known = [] if self.mode is None else [self.mode[None]]
         rigid = self._rigid_motions(q)
-        if rigid is None:
-            return search.lowest([noise, *known], BLOCK, LONGEST_SEARCH)
-        _, modes = search.lowest([search.without(rigid, noise)], BLOCK, LONGEST_SEARCH, rigid)
-        return search.lowest([modes, *known, rigid], BLOCK, LONGEST_SEARCH)
+
+        def noise(count: int) -> Rows:
+            start = search.random(count)
+            if hint is not None:
+                start[0] += search.unit(self.functional.memory.read(hint)[None])[0]
+            return start
+
+        # No rigid motion delays a mode, and all modes converge fast
+        if rigid is None and is_uniform:
+            start = [noise(block - len(known)), *known]
+            return search.lowest(start, block, LONGEST_SEARCH, least)
+        start = [search.without(rigid, noise(block - is_uniform * len(known)))]
+        _, modes = search.lowest(start, block, LONGEST_SEARCH, least, left_out=rigid)
+        start = [modes, *known, *([] if rigid is None else [rigid])]
+        return search.lowest(start, block, LONGEST_SEARCH, least // 2)
 
     def _rigid_motions(self, q: Positions) -> Rows | None:
         """Return translations and rotations (6, n) of a free body at positions q (l, 3) [m].
@@ -209,4 +253,4 @@ class LowestCurvature:
 
     def forget(self) -> None:
         """Forget the mode and its search."""
-        self.searched, self.mode = 0.0, None
+        self.searched, self.mode = NONE, None

@@ -21,7 +21,7 @@ from petsc4py import PETSc
 
 from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
 from msmpetsc.errors import StepFailed
-from msmpetsc.solve.nonlinear.curvature import Compression, LowestCurvature
+from msmpetsc.solve.nonlinear.curvature import Alarm, Compression, LowestCurvature
 from msmpetsc.solve.nonlinear.error_estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional
 
@@ -64,7 +64,7 @@ class Outcome:
     distance    : |x - y|_M of the iterate
     reduction   : residual over the residual of the iterate before
     corrected   : whether the error was estimated, so that the Newton correction is known
-    alarm       : whether a solve has met a negative curvature
+    alarm       : place where a solve has met a negative curvature
     at_rounding : whether F is rounding alone
     doubts      : number of points found to be no minimum, or farther from it than estimated
     compression : of the iterate; None if not yet computed
@@ -77,7 +77,7 @@ class Outcome:
     distance: float = 0.0
     reduction: float = 1.0
     corrected: bool = False
-    alarm: bool = False
+    alarm: Alarm = Alarm.NOWHERE
     at_rounding: bool = False
     doubts: int = 0
     compression: Compression | None = None
@@ -118,15 +118,12 @@ class ErrorControl:
         )
         stays = residual > STAYS * before.residual
         at_rounding = self.rounding.explains(iterate, stays)
+        alarm = min(before.alarm, Alarm.ON_THE_WAY)
         now = replace(
-            before,
-            residual=residual,
-            distance=distance,
-            at_rounding=at_rounding,
-            corrected=False,
-            reduction=residual / before.residual if np.isfinite(before.residual) else 1.0,
-            compression=None,
+            before, residual=residual, distance=distance, at_rounding=at_rounding, alarm=alarm
         )
+        reduction = residual / before.residual if np.isfinite(before.residual) else 1.0
+        now = replace(now, corrected=False, reduction=reduction, compression=None)
         # No error is relative to the start x = y
         if not distance > 0 or not np.isfinite(residual):
             return replace(now, error=0.0 if at_rounding else np.inf)
@@ -169,7 +166,7 @@ class ErrorControl:
         """
         length = self.estimate(iterate, goal * now.distance)
         if not np.isfinite(length):
-            return replace(now, error=now.bound, alarm=True)
+            return replace(now, error=now.bound, alarm=Alarm.HERE)
         return self.measured(iterate, now)
 
     def measured(self, iterate: Iterate, now: Outcome, trust: float = 1.0) -> Outcome:

@@ -6,6 +6,7 @@ step's preconditioner. A block is needed since a single direction may settle on 
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -18,8 +19,6 @@ from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 
 # Most iterations of a long search
 LONGEST_SEARCH = 100
-# Fewest iterations of a search whose lowest eigenvalue is positive
-LEAST = 3
 # A long search ends if the lowest eigenvalue is above this share of its value half as
 # many iterations ago; if it is negative, above the inverse of this share
 SETTLED = 0.95
@@ -31,6 +30,25 @@ DEPENDENT = 1e-10
 CHUNK = 1 << 16
 
 Act = Callable[[None, PETSc.Vec, PETSc.Vec], None]
+
+
+class SearchEffort(NamedTuple):
+    """Effort of searches.
+
+    block    : directions of a long search
+    least    : fewest iterations of a long search
+    followed : iterations of a short search, which has two directions
+    """
+
+    block: int
+    least: int
+    followed: int
+
+
+EFFORT = SearchEffort(4, 12, 2)
+# With multigrid smooth modes converge at once. After an alarm EFFORT is taken all the
+# same: a folded body may hide its lowest mode.
+UNIFORM_EFFORT = SearchEffort(2, 3, 1)
 
 
 @dataclass
@@ -88,19 +106,27 @@ class Lobpcg:
         return self.unit(noise)
 
     def lowest(
-        self, start: list[Rows], block: int, most: int, left_out: Rows | None = None
+        self,
+        start: list[Rows],
+        block: int,
+        most: int,
+        least: int,
+        left_out: Rows | None = None,
     ) -> tuple[Floats, Rows]:
         """Return the lowest eigenvalues (k,), k <= block, of M^(-1) H and their modes (k, n).
 
         start    : directions (l, n) in parts, which the search takes out of the list
         most     : most iterations
+        least    : fewest iterations
         left_out : directions (r, n), orthonormal in M, that the search leaves out
         """
         lowest = []
         for its, ritz in enumerate(self.iterates(start, block, left_out)):
             lowest.append(ritz[0][0])
-            least, settled = (2, 1 / SETTLED) if lowest[-1] < 0 else (LEAST, SETTLED)
-            if its == most or (its >= least and lowest[-1] > settled * lowest[its // 2]):
+            if its == most:
+                break
+            least_its, settled = (2, 1 / SETTLED) if lowest[-1] < 0 else (max(least, 1), SETTLED)
+            if its >= least_its and lowest[-1] > settled * lowest[its // 2]:
                 break
         return ritz[0], ritz[1].copy()
 

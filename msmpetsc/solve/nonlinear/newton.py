@@ -19,6 +19,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Array, Positions
 from msmpetsc.contact.step_contact import StepContactAt
+from msmpetsc.solve.nonlinear.curvature import Alarm
 from msmpetsc.solve.nonlinear.error_control import Outcome
 from msmpetsc.solve.nonlinear.functional import Iterate
 from msmpetsc.solve.nonlinear.jacobian import FrictionDuals
@@ -198,7 +199,7 @@ class Newton(StepMethod):
         self.ksp.solve(now.f, self.y)
         self.jacobian.preconditioner.learn(self.ksp.its, rtol)
         if self.ksp.reason == KSP.DIVERGED_INDEFINITE_MAT:
-            return replace(outcome, alarm=True, corrected=False)
+            return replace(outcome, alarm=Alarm.HERE, corrected=False)
         if self.control.estimate.is_accepted:
             return self.control.measured(now, outcome, self._trust(now, outcome))
         return replace(outcome, corrected=tells_error and self.ksp.reason > 0)

@@ -34,6 +34,8 @@ PROJECTED = 5
 SOFTER = 9.0
 # Share of the slope by which a step must lower g (Armijo)
 ALPHA = 1e-4
+# Least and greatest share of a step length that the line search tries next
+LEAST, MOST = 0.1, 0.5
 # Least step length; along a rising direction g may seem to fall by rounding
 SHORTEST = 1e-6
 # Share of its slope that a direction must keep when it is bent at obstacles
@@ -230,6 +232,7 @@ class Newton(StepMethod):
         flat : g is so close to its minimum that its change has no digits; take the full step
         """
         slope, s, x = -abs(self.y.dot(now.f)), 1.0, self.functional.vectors.take()
+        longer = None
         while s > SHORTEST:
             x.waxpy(-s, self.y, now.x)
             with LOCAL:
@@ -238,7 +241,7 @@ class Newton(StepMethod):
                 change = -np.inf if flat else self.functional.change(q, now.q)
                 if change <= ALPHA * s * slope:
                     return self.functional.iterate(x, q)
-            s /= 2
+            s, longer = shorter(slope, (s, change), longer), (s, change)
         self.functional.vectors.give_back(x)
         return None
 
@@ -280,3 +283,29 @@ class Newton(StepMethod):
             return end
         bent.copy(self.y)
         return free
+
+
+def shorter(slope: float, tried: tuple[float, float], longer: tuple[float, float] | None) -> float:
+    """Return the next step length of a line search.
+
+    The length minimises the cubic through the slope at 0 and the last two changes of g. After the
+    first trial it minimises the parabola. It is between LEAST and MOST times the last length
+    (Dennis and Schnabel 1996, Numerical Methods for Unconstrained Optimization, A6.3.1). If the
+    last change is not finite, it is LEAST times the last length.
+
+    slope  : derivative of g by the step length at 0
+    tried  : last step length and change of g there
+    longer : step length before and change of g there; None after the first trial
+    """
+    s, change = tried
+    if not np.isfinite(change):
+        return LEAST * s
+    bend = (change - s * slope) / s**2
+    best = -slope / (2 * bend)
+    if longer is not None and np.isfinite(longer[1]):
+        t, far = longer
+        of_far = (far - t * slope) / t**2
+        a, b = (bend - of_far) / (s - t), (s * of_far - t * bend) / (s - t)
+        if a != 0:
+            best = (-b + np.sqrt(max(b**2 - 3 * a * slope, 0.0))) / (3 * a)
+    return float(min(max(best, LEAST * s), MOST * s))

@@ -9,8 +9,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from mpi4py import MPI
+from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Floats, greatest
+from msmpetsc.backend.arrays import Floats, Positions, greatest
 from msmpetsc.solve.nonlinear.curvature import LowestCurvature
 from msmpetsc.solve.nonlinear.error_control import Outcome
 from msmpetsc.solve.nonlinear.error_estimate import ErrorEstimate
@@ -111,13 +112,21 @@ class Optimality:
 
     def _corrected_iterate(self, at: Iterate) -> Iterate | None:
         """Return the iterate x - e; None if the surface crosses itself on the path."""
+        x, q, is_free = self._corrected(at)
+        if not is_free:
+            self.functional.vectors.give_back(x)
+            return None
+        return self.functional.iterate(x, q)
+
+    def _corrected(self, at: Iterate) -> tuple[PETSc.Vec, Positions, bool]:
+        """Return the unknowns x - e, their positions (l, 3) [m], and whether the path is free.
+
+        The caller gives the vector of unknowns back.
+        """
         functional, x = self.functional, self.functional.vectors.take()
         x.waxpy(-1.0, self.estimate.correction, at.x)
         q = functional.positions(x)
-        if functional.collision_free_step(at.q, q) < 1.0:
-            functional.vectors.give_back(x)
-            return None
-        return functional.iterate(x, q)
+        return x, q, functional.collision_free_step(at.q, q) == 1.0
 
     def _second_estimate(
         self, examined: Iterate, first: float, bound: float, acceptable: float, lowest: float
@@ -133,9 +142,13 @@ class Optimality:
         second = estimate(examined, max(acceptable - first, 0.0) if lowest > CONVEX else 0.0)
         if not np.isfinite(second):
             return relative(first + bound, distance) if lowest > CONVEX else np.inf
-        crosses = functional.surface and self._corrected_iterate(examined) is None
-        if crosses or (first > 0 and estimate.correction_norm > SMALL * first):
-            return relative(first + DOUBTFUL * second, distance)
+        if functional.surface is not None:
+            end, _, is_free = self._corrected(examined)
+            functional.vectors.give_back(end)
+            if not is_free:
+                return relative(first + DOUBTFUL * second, distance)
+        if first > 0 and estimate.correction_norm > SMALL * first:
+            return DOUBTFUL * relative(max(first, second), distance)
         return relative(first + second, distance)
 
     def lower_iterate(self, at: Iterate, verdict: Verdict) -> Iterate | None:

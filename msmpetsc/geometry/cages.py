@@ -259,6 +259,8 @@ def _warn_of_masses(
         return
     if not is_weighted:
         remedy = 'cages.boundary = "whole" counts cut cells whole'
+    elif bodies[worst].report.inconsistent_edges:
+        remedy = 'triangles are wound against each other, which prepare = ["orient"] mends'
     elif excess[worst] > 0:
         remedy = 'it is far thinner than a cell, or parts are wound inwards: prepare = ["orient"]'
     else:

@@ -36,7 +36,8 @@ class EmbeddedPoints:
     """
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice, embedding: csr_array):
-        columns, local = np.unique(embedding.indices, return_inverse=True)
+        # a route's rows have the same type on all ranks, scipy's indices have not
+        columns, local = np.unique(embedding.indices.astype(np.int64), return_inverse=True)
         shape = embedding.shape[0], len(columns)
         self.weights = csr_array((embedding.data, local.ravel(), embedding.indptr), shape=shape)
         self.to_owner = Route(comm, lattice.table.owner_of_index(columns))

@@ -47,9 +47,10 @@ def problem_lines(path: Path, error: ValidationError) -> list[str]:
 def _words(e: ErrorDetails) -> str:
     """Return the message of a problem, without its place."""
     words = WORDS.get(e["type"]) or re.sub(r"^\w+ should", "must", e["msg"])
-    if e["type"] in ("missing", "unknown_key"):
-        return words
     value = e["input"]
+    # a table that was read has no words of TOML
+    if e["type"] in ("missing", "unknown_key") or "BaseModel" in str(type(value).__mro__):
+        return words
     got = as_given(value)
     return f"{words}, got {json.dumps(got, ensure_ascii=False) if isinstance(value, str) else got}"
 

@@ -48,7 +48,7 @@ law = "neo-hookean" # a solid; "linear": the paper's springs
 poisson_ratio = 0.25 # [-]; tissue has 0.45, rubber 0.49
 
 [time]
-step = {step:.1g} # [s]; a fortieth of the period of its slowest motion
+step = {step:.1g} # [s]; a fortieth of the period of a wave along its height
 duration = {duration:.2g} # [s]
 
 [gravity]

@@ -166,6 +166,17 @@ CASES = {
         "pin": [{"region": {"box": [[-1, -1, -1], [1, 1, 0.01]]}}], "solver": {"error": 1e-8},
         "time": steps(6, 0.05),
     }, accuracy=1e-6),
+    # obstacles lead the body by more than the barrier's distance
+    "squeezed": Case({
+        "mesh": {"source": "squeezed.ply", "prepare": [{"refine": 0.1}]}, "material": SOLID,
+        "obstacle": [
+            box_at([[-0.3, -0.3, -0.1], [0.8, 0.8, -0.004]], response="barrier"),
+            box_at([[-0.3, -0.3, 0.252], [0.8, 0.8, 0.35]], response="barrier",
+                   center=[0.25, 0.25, 0.252],
+                   path=[{"time": 0.02, "by": [0, 0, -0.1], "turn": [6, 0, 0]}]),
+        ],
+        "solver": {"error": 1e-8}, "time": steps(2, 0.01),
+    }, accuracy=1e-6),
     **{f"led, {preset}": led(preset) for preset in ("newton", "anderson", "fast-msm")},
 }  # fmt: skip
 # numbers of frames that are compared where they are stored

@@ -68,8 +68,10 @@ class PartsOfPoints:
             triangles = self.surface.triangles[self.triangle[around]]
             given = points[row : row + 1], self.surface.points
             # a node within the body is in the part whose boundary is nearest
+            if not is_own.any():
+                continue
             if is_in and is_own[igl.point_mesh_squared_distance(*given, triangles)[1]]:
                 nearest[row] = points[row]
-            elif is_own.any():
+            else:
                 nearest[row] = igl.point_mesh_squared_distance(*given, triangles[is_own])[2]
         return nearest

@@ -15,6 +15,7 @@ from block_scene import (
     model_of,
     play,
     solid_of,
+    write_scene,
 )
 from crossings import count_crossings, crossings
 from mpi4py import MPI
@@ -264,3 +265,19 @@ def test_explicit_steps_refuse_it(tmp_path: Path):
     time = {"step": 0.02, "duration": 0.2, "integrator": "verlet"}
     scene = fine_block(tmp_path, time=time, obstacle=[FLOOR])
     assert 'obstacle: response = "barrier" is for' in input_error(lambda: load_scene(scene))
+
+
+def test_a_ball_whose_nodes_have_no_triangle_around_is_built(tmp_path: Path):
+    """Some of its nodes are corners of cells that hold no triangle of the surface."""
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.15)
+    ball.apply_translation([0, 0, 0.152])
+    ball.export(tmp_path / "scene.ply")
+    scene = write_scene(
+        tmp_path,
+        mesh={"source": "scene.ply"},
+        cages={"count": 71},
+        material=SOLID,
+        time={"step": 0.01, "duration": 0.01},
+        obstacle=[FLOOR],
+    )
+    assert len(model_of(scene).lattice.cells) == 72

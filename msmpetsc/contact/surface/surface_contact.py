@@ -231,7 +231,8 @@ class SurfaceContact:
         if moment is None:
             return
         moved = np.zeros_like(moment.points)
-        moved[self.contacts.points.bodies :] = displacements
+        if len(moved):
+            moved[self.contacts.points.bodies :] = displacements
         whole = self._whole_hessian(moment, True, None)
         self._add_to_nodes(
             moved if whole is None else (whole @ moved.ravel()).reshape(-1, 3), gradient

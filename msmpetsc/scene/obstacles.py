@@ -131,8 +131,15 @@ class SelfContactTable(Table):
     distance: Positive | None = Field(
         None,
         description="distance at which surface parts start to repel each other [m]; if absent the "
-        "greater of 3e-4 of the rest bounding box's diagonal and the lesser of 1/24 of a cell and "
-        "the least gap at rest",
+        "greatest of 3e-4 of the rest bounding box's diagonal, the median distance of a coarser "
+        "surface from the body's own, and the lesser of 1/24 of a cell and the least gap at rest",
     )
     friction: NotNegative = Field(0.0, description="Coulomb friction coefficient [-]")
     friction_speed: Positive | None = Field(None, description=FRICTION_SPEED)
+    surface: int | None = Field(
+        None,
+        ge=4,
+        lt=2**63,
+        description="triangles of a coarser surface used for contact [-]; the surface itself if "
+        "absent",
+    )

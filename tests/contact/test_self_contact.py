@@ -6,6 +6,7 @@ Also resumed runs, meshes that cut themselves, and refusals.
 from pathlib import Path
 from types import SimpleNamespace
 
+import igl
 import numpy as np
 import pytest
 import trimesh
@@ -240,6 +241,43 @@ def test_a_surface_that_cuts_itself_all_over_is_refused(tmp_path):
     trimesh.util.concatenate([u_tube(), u_tube(around=15, along=57)]).export(tmp_path / "u.ply")
     with pytest.raises(InputError, match=r"self_contact: .* cut others at rest.*union.*repair"):
         model_of(path)
+
+
+def test_a_coarser_surface_that_cuts_itself_is_no_fault_of_the_mesh(tmp_path):
+    """Flat faces leave slivers on the edges of the coarser surface."""
+    path = block_scene(
+        tmp_path, self_contact={"surface": 300}, time={"step": 0.01, "duration": 0.01}
+    )
+    block = trimesh.creation.box([0.5, 0.5, 0.25]).subdivide().subdivide().subdivide()
+    block.export(tmp_path / "scene.ply")
+    with pytest.raises(InputError, match=r"leave out self_contact\.surface"):
+        model_of(path)
+    assert model_of(path, "self_contact={}").collision is not None
+
+
+def test_a_coarser_surface_lies_on_the_body_says_how_far_it_is_off_and_pushes_from_there(
+    tmp_path, caplog
+):
+    model = model_of(pinch_scene(tmp_path, self_contact={"surface": 400}))
+    surface, whole = model.collision.surface, model.surface.points
+    assert 300 < len(surface.triangles) <= 400
+    squares = igl.point_mesh_squared_distance(surface.points, whole, model.surface.triangles)[0]
+    assert squares.max() < 1e-18
+    np.testing.assert_allclose(
+        model.collision.points(model.lattice.nodes, 0.0), surface.points, atol=1e-12
+    )
+    off = np.sqrt(igl.point_mesh_squared_distance(whole, surface.points, surface.triangles)[0])
+    words = f"{off.max():.2g} m off the drawn surface, half of it by more than {np.median(off):.2g}"
+    assert words in caplog.text
+    diagonal = np.linalg.norm(np.ptp(whole, axis=0))
+    cell = model.lattice.cell_size
+    assert model.collision.law.distance == pytest.approx(max(np.median(off), cell / 24))
+    assert np.median(off) > 3e-4 * diagonal
+    caplog.clear()
+    far = {"surface": 400, "distance": 1.01 * off.max()}
+    model = model_of(pinch_scene(tmp_path, self_contact=far))
+    assert model.collision.law.distance > off.max()
+    assert "the drawn surface" not in caplog.text
 
 
 @pytest.mark.parametrize(

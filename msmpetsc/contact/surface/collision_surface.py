@@ -1,4 +1,7 @@
-"""Surface of bodies that meets itself and obstacles, without triangles that cross at rest."""
+"""Surface that meets itself and obstacles: the surface of the bodies or a coarser surface.
+
+Triangles that cross at rest are left out.
+"""
 
 from collections.abc import Sequence
 
@@ -17,6 +20,7 @@ from msmpetsc.errors import InputError, body_names
 from msmpetsc.geometry.cages import BodySurface, Cages
 from msmpetsc.geometry.embedding import embed
 from msmpetsc.geometry.grid import ON_PLANE
+from msmpetsc.geometry.prepare import simplify
 from msmpetsc.geometry.surface import Surface, compact, have_three_corners, joined, outward
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.obstacles import SelfContactTable
@@ -32,6 +36,11 @@ SHARE = 1 / 24
 MOST_CUT = 0.1
 # Edge length beyond which a triangle is long [cells]
 LONG = 2.0
+# Fewest triangles of a body
+FEWEST = 20
+# Speed of the decimation; with its default, 7, the coarser surface is two to four times
+# as far off
+HASTE = 4
 
 
 def collision_surface(
@@ -56,8 +65,8 @@ def collision_surface(
     whole = [body.surface for body in bodies if body.surface]
     meets_itself = scene.self_contact is not None
     prepared = on_root(comm, lambda: _prepared(whole, table, meets_itself, lattice.cell_size))
-    surfaces, edge = prepared or ([], 0.0)
-    edge = comm.bcast(edge)
+    surfaces, *lengths = prepared or ([],)
+    off, edge = comm.bcast(lengths)
     met = obstacle_surfaces(scene, obstacles, edge)
     points = [surface.points for surface in surfaces] or [np.empty((0, 3))] * len(bodies)
     embedding = embed(points, cages, lattice.table, scene.cages.embedding, scene.cages.smoothing)
@@ -65,7 +74,9 @@ def collision_surface(
     joint = on_root(comm, lambda: joined([*surfaces, *met.solids]))
     least, bodies_end = NEAR * float(np.linalg.norm(sides)), sum(map(len, points))
     widest = min(SHARE * lattice.cell_size, edge / 2)
-    distance = table.distance or max(least, _gap(comm, joint, widest, bodies_end, meets_itself))
+    distance = table.distance or max(
+        least, off, _gap(comm, joint, widest, bodies_end, meets_itself)
+    )
     side = smallest(np.array([body.bounds for body in bodies]))
     law = BarrierLaw.of_lattice(distance, table, lattice, scene.time.step, side)
     carried = SurfacePoints(comm, lattice, embedding, met)
@@ -79,30 +90,39 @@ def collision_surface(
 
 def _prepared(
     bodies: list[Surface], table: SelfContactTable, meets_itself: bool, cell_size: float
-) -> tuple[list[Surface], float]:
-    """Return the contact surfaces and their mean edge [m].
+) -> tuple[list[Surface], float, float]:
+    """Return the contact surfaces, their distance from the bodies' surfaces, and their mean edge.
 
-    Triangles that cross, or name a point twice, are left out.
+    The surfaces have about as many triangles as the table asks for; all triangles if it names no
+    number. Triangles that cross, or name a point twice, are left out. The distance is the median
+    over the bodies' points [m].
 
     Raises InputError if too many triangles cross.
     """
-    three = [have_three_corners(body.triangles) for body in bodies]
+    off, three = 0.0, [have_three_corners(body.triangles) for body in bodies]
     bodies = [
         body if kept.all() else compact(body.points, body.triangles[kept])
         for body, kept in zip(bodies, three, strict=True)
     ]
+    if table.surface is not None:
+        share = table.surface / sum(len(body.triangles) for body in bodies)
+        coarser = [
+            _coarser(body, max(round(share * len(body.triangles)), FEWEST)) for body in bodies
+        ]
+        bodies, off = coarser, _off(bodies, coarser, table.distance or 0.0)
     if meets_itself:
         longest = max(float(np.linalg.norm(np.ptp(body.points, axis=0))) for body in bodies)
         # Points within ON_PLANE of a plane of the grid snap to it, which would close a
         # smaller gap
         gap = max(NEAREST * (table.distance or NEAR * longest), 2 * ON_PLANE * longest)
-        bodies = _without_crossing_triangles(_parted(bodies, gap))
+        bodies = _without_crossing_triangles(_parted(bodies, gap), table.surface is not None)
     ends = np.concatenate(
         [b.points[b.triangles] - b.points[np.roll(b.triangles, 1, axis=1)] for b in bodies]
     )
     edges = np.linalg.norm(ends, axis=2)
-    _warn_of_long_triangles(edges.max(), max(cell_size, 2 * (table.distance or 0.0)))
-    return bodies, float(edges.mean())
+    if table.surface is None:
+        _warn_of_long_triangles(edges.max(), max(cell_size, 2 * (table.distance or 0.0)))
+    return bodies, off, float(edges.mean())
 
 
 def _gap(
@@ -172,8 +192,11 @@ def _parted(bodies: list[Surface], gap: float) -> list[Surface]:
     return [Surface(body.points - gap * outward(body), body.triangles) for body in bodies]
 
 
-def _without_crossing_triangles(bodies: list[Surface]) -> list[Surface]:
-    """Return surfaces without crossing triangles. Raises InputError if too many cross."""
+def _without_crossing_triangles(bodies: list[Surface], are_coarser: bool) -> list[Surface]:
+    """Return surfaces without crossing triangles. Raises InputError if too many cross.
+
+    are_coarser : whether the surfaces are coarser than the mesh, which may make them cross
+    """
     whole = joined(bodies)
     assert whole is not None
     cut = Barrier(whole, BarrierLaw(1.0, 1.0, 0.0, 1.0), len(whole.points)).crossings()
@@ -187,10 +210,36 @@ def _without_crossing_triangles(bodies: list[Surface]) -> list[Surface]:
         fault += f" (of {names}, which must be moved apart if they overlap)"
     if len(cut) > MOST_CUT * len(whole.triangles):
         remedy = 'mesh.prepare = ["union"] or ["repair"] may mend the mesh'
+        if are_coarser:
+            remedy = f"leave out self_contact.surface, or raise it; if that fails, {remedy}"
         raise InputError(f"{fault}, too many to leave out: {remedy}")
     log.warning("%s: they are left out, and may be crossed", fault)
     of_body = np.split(~np.isin(np.arange(len(whole.triangles)), cut), ends)
     return [compact(b.points, b.triangles[kept]) for b, kept in zip(bodies, of_body, strict=True)]
+
+
+def _off(bodies: list[Surface], coarser: list[Surface], distance: float) -> float:
+    """Return the median distance [m] of the bodies' points from the coarser surfaces.
+
+    Warn if the greatest distance shows that a part was lost.
+    """
+    import igl
+
+    squares = [
+        igl.point_mesh_squared_distance(body.points, coarse.points, coarse.triangles)[0]
+        for body, coarse in zip(bodies, coarser, strict=True)
+    ]
+    off = np.sqrt(np.concatenate(squares))
+    if off.max() > distance:
+        log.warning(
+            "self_contact.surface: the contact surface of %d triangles is up to %.2g m off the "
+            "drawn surface, half of it by more than %.2g m: drawn surfaces may cross by as much; "
+            "more triangles bring it nearer",
+            sum(len(coarse.triangles) for coarse in coarser),
+            off.max(),
+            np.median(off),
+        )
+    return float(np.median(off))
 
 
 def _warn_of_long_triangles(longest: float, length: float) -> None:
@@ -207,3 +256,17 @@ def _warn_of_long_triangles(longest: float, length: float) -> None:
             longest,
             length,
         )
+
+
+def _coarser(surface: Surface, triangles: int) -> Surface:
+    """Return a surface of about so many triangles with its points on the given surface.
+
+    So its points lie in the cells of the body.
+    """
+    import igl
+
+    reduced = simplify(surface, triangles, HASTE)
+    _, _, nearest = igl.point_mesh_squared_distance(
+        reduced.points, surface.points, surface.triangles
+    )
+    return compact(np.ascontiguousarray(nearest), reduced.triangles)

@@ -63,5 +63,9 @@ def as_given(value: Any) -> str:
         # the repr of a NumPy 2 scalar includes its type
         shown = repr(float(value))
     else:
-        shown = json.dumps(value, ensure_ascii=False, default=str)
+        try:
+            shown = json.dumps(value, ensure_ascii=False, default=str)
+        # Python writes no integer of over 4,300 digits
+        except ValueError:
+            return "a number too long to show"
     return printable(shown, 60) if len(shown) <= 60 else printable(shown, 57) + "..."

@@ -36,6 +36,12 @@ def _unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:
     return x / length, y / length, z / length
 
 
+def _some(components: tuple[str, ...]) -> tuple[str, ...]:
+    if not components:
+        raise rule("must name one to three components")
+    return components
+
+
 # below 1e60, so that the fourth power is finite
 Positive = Annotated[float, Field(gt=0, lt=1e60)]
 NotNegative = Annotated[float, Field(ge=0, lt=1e60)]
@@ -46,7 +52,7 @@ T = TypeVar("T")
 ListOf = Annotated[tuple[T, ...], Strict(False)]
 Vector = Annotated[tuple[float, float, float], Strict(False)]
 Direction = Annotated[Vector, AfterValidator(_nonzero)]
-Components = Annotated[tuple[Literal["x", "y", "z"], ...], Strict(False), Field(min_length=1)]
+Components = Annotated[tuple[Literal["x", "y", "z"], ...], Strict(False), AfterValidator(_some)]
 UnitVector = Annotated[Vector, AfterValidator(_unit)]
 
 

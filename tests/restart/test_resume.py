@@ -265,7 +265,7 @@ def test_frames_after_the_checkpoint_are_kept_as_they_are(whole: Path, tmp_path,
         assert status_of("run", whole.with_name("scene.toml"), *arguments) == 1
     with h5py.File(path) as file:
         assert max(file["checkpoint/step"]) == 0 and finished(file) == 8
-        times = file["frames/wall_time"][:]
+        times = file["frames/wall_time"][:8]
     assert status_of("run", "--resume", path) == 0
     assert_same(path, whole)
     with h5py.File(path) as file:

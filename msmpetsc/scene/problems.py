@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails, PydanticCustomError
 
 from msmpetsc.errors import did_you_mean, printable
@@ -48,8 +48,10 @@ def _words(e: ErrorDetails) -> str:
     """Return the message of a problem, without its place."""
     words = WORDS.get(e["type"]) or re.sub(r"^\w+ should", "must", e["msg"])
     value = e["input"]
-    # a table that was read has no words of TOML
-    if e["type"] in ("missing", "unknown_key") or "BaseModel" in str(type(value).__mro__):
+    tables = value if isinstance(value, tuple) else (value,)
+    # tables that were read are no longer TOML
+    is_read = any(isinstance(table, BaseModel) for table in tables)
+    if e["type"] in ("missing", "unknown_key") or is_read:
         return words
     got = as_given(value)
     return f"{words}, got {json.dumps(got, ensure_ascii=False) if isinstance(value, str) else got}"

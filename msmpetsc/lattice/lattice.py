@@ -184,7 +184,11 @@ def build_lattice(
     net = topology or topology_of(cages)
     is_solid = material.poisson is not None
     first_owned = net.cells[:, 0] < len(net.octants)
-    kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(~first_owned & is_solid)])
+    further = ~first_owned & is_solid
+    # a slice keeps arrays as they are, for example a row that whole cells share
+    kept: Indices | slice = slice(None)
+    if not first_owned.all():
+        kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(further)])
     springs, make_springs = NO_SPRINGS, None
     if is_solid:
         make_springs = partial(_springs_of_solid, net, h, material, of_cells)

@@ -149,9 +149,12 @@ def stiffness_of_solid(
 
 def _forms(fills: Rows, moments: Rows) -> tuple[Rows, Floats, Indices]:
     """Return the strain forms (d, 13) and volumes (d,) [cells] of cells, and which are cut."""
-    forms, cut = np.tile(WHOLE, (len(fills), 1)), np.flatnonzero(fills.min(axis=1) < 1)
-    forms[cut] = forms_of(fills[cut], moments[cut])
-    return forms, fills.mean(axis=1), cut
+    # whole cells share a row
+    forms, cut = np.broadcast_to(WHOLE, (len(fills), len(WHOLE))), (fills < 1).any(axis=1)
+    if cut.any():
+        forms = forms.copy()
+        forms[cut] = forms_of(fills[cut], moments[cut])
+    return forms, fills.mean(axis=1), np.flatnonzero(cut)
 
 
 def _sums_of_springs(net: Topology, springs: SpringNet, values: Floats, weights: Rows) -> Floats:

@@ -234,11 +234,14 @@ def _override(data: dict[str, Any], override: str) -> KeyPath:
 def _override_value(raw: str) -> Any:
     """Return the value of an override: TOML, or else a bare string. Raises InputError."""
     try:
-        return tomllib.loads(f"value = {raw}")["value"]
+        value, *others = tomllib.loads(f"value = {raw}").values()
     except (ValueError, RecursionError):
         if raw[0] in "\"'[{":
             raise InputError("the value is not TOML") from None
         return raw
+    if others:
+        raise InputError("must hold a single value")
+    return value
 
 
 def _put(container: Any, key: str | int, value: Any, replace: bool) -> Any:

@@ -314,6 +314,7 @@ def test_overrides_make_tables_and_lists_and_the_last_one_wins(tmp_path):
         ("cages.count", "--set cages.count: must read key.path=value"),
         ("cages..count=1", "--set cages..count=1: must read key.path=value"),
         ("mesh.size=[1", "--set mesh.size=[1: the value is not TOML"),
+        ("mesh.size=1\nb=2", "--set mesh.size=1 b=2: must hold a single value"),
         ("mesh.size.x=1", "--set mesh.size.x=1: 'x' has no place in 0.3"),
         ("pin.3.region=1", "--set pin.3.region=1: 3 is no item of a list of 2"),
     ],

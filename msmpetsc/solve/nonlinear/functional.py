@@ -173,8 +173,8 @@ class StepFunctional:
         inertia = 0.5 * self._inner(moved, moved)
         return float(self.comm.allreduce(inertia + self.t2 * acting))
 
-    def change(self, q: Positions, base: Positions) -> float:
-        """Return g(q) - g(base) [kg m^2] of positions (l, 3) [m].
+    def change(self, q: Positions, base: Positions) -> tuple[float, float]:
+        """Return g(q) - g(base) [kg m^2] and |q - base|^2 [m^2] of positions (l, 3) [m].
 
         Differences are summed term by term, so that a small change keeps its digits.
         """
@@ -187,7 +187,10 @@ class StepFunctional:
             if problem.contact:
                 with CONTACT:
                     elastic += problem.contact.change(q, base)
-            return float(self.comm.allreduce(inertia + self.t2 * elastic))
+            change, squared = self.comm.allreduce(
+                np.array([inertia + self.t2 * elastic, float(np.vdot(moved, moved))])
+            )
+        return change, squared
 
     @property
     def surface(self) -> SurfaceContact | None:

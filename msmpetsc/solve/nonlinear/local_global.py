@@ -86,8 +86,8 @@ class LocalGlobal(StepMethod):
         If the difference has no digits left, return -1, so that the line search accepts x.
         """
         with LOCAL:
-            change = self.functional.change(self.functional.positions(x), self.base)
-        return -1.0 if self.outcome.is_flat and change else change
+            change, distance = self.functional.change(self.functional.positions(x), self.base)
+        return -1.0 if self.outcome.is_flat and distance > 0 else change
 
     def _linearise(self, snes: PETSc.SNES, x: PETSc.Vec, _: PETSc.Mat, __: PETSc.Mat) -> None:
         """Linearise contact at x and set the initial guess of the linear solve (SNESJacobian)."""

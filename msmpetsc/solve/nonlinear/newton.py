@@ -238,7 +238,7 @@ class Newton(StepMethod):
             with LOCAL:
                 q = self.functional.positions(x)
                 self.friction.update(q, now.q, s == 1.0)
-                change = -np.inf if flat else self.functional.change(q, now.q)
+                change, _ = (-np.inf, 0.0) if flat else self.functional.change(q, now.q)
                 if change <= ALPHA * s * slope:
                     return self.functional.iterate(x, q)
             s, longer = shorter(slope, (s, change), longer), (s, change)

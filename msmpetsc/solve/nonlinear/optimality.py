@@ -156,7 +156,7 @@ class Optimality:
 
         It is the point examined, or a point farther along a direction of negative curvature.
         """
-        falls = self.functional.change(verdict.examined.q, at.q) < 0
+        falls = self.functional.change(verdict.examined.q, at.q)[0] < 0
         lower = verdict.examined if falls else None
         if verdict.direction is None:
             return lower
@@ -180,7 +180,7 @@ class Optimality:
             self.memory.write(x)[:] = self.memory.read(at.x) + move * direction
             q = functional.positions(x)
             is_free = functional.collision_free_step(base, q) == 1.0
-            change = functional.change(q, base) if is_free else np.inf
+            change = functional.change(q, base)[0] if is_free else np.inf
             if change < lowest:
                 best, lowest = move, change
                 move *= 2

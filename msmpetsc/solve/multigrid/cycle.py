@@ -47,6 +47,9 @@ from msmpetsc.solve.petsc.library import (
 
 # most nodes of the coarsest grid, which is factored; coarser grids lose thin limbs
 COARSEST = 1000
+# the same, over the root of the lattice's nodes; the factor of a larger grid costs as much as the
+# finest level
+COARSEST_ROOT = 9.0
 # most surface points that the finest smoother couples; its matrix is dense
 POINTS = 200
 # lower end of a smoother's range, over its upper end; coarse grids damp the rest
@@ -138,7 +141,8 @@ class Multigrid:
         keys = (everywhere + offsets)[free]
         asked = PETSc.Options(self.prefix).getInt("pc_mg_levels", 0)
         count = max(asked - 1, 1) if asked else None
-        coarse = grids(comm, keys, copies, free, unknowns.total, COARSEST, count)
+        coarsest = min(COARSEST, int(COARSEST_ROOT * np.sqrt(unknowns.total)))
+        coarse = grids(comm, keys, copies, free, unknowns.total, coarsest, count)
         if asked and asked != len(coarse) + 1:
             nearest = len(coarse) + 1
             raise InputError(

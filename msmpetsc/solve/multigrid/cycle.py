@@ -47,8 +47,8 @@ from msmpetsc.solve.petsc.library import (
 
 # most nodes of the coarsest grid, which is factored; coarser grids lose thin limbs
 COARSEST = 1000
-# the same, over the root of the lattice's nodes; the factor of a larger grid costs as much as the
-# finest level
+# the same, over the root of the lattice's nodes; the factor of a larger grid costs as much
+# as the finest level
 COARSEST_ROOT = 9.0
 # most surface points that the finest smoother couples; its matrix is dense
 POINTS = 200

@@ -72,7 +72,7 @@ class ErrorEstimate:
         pc.setType(PETSc.PC.Type.PYTHON)
         pc.setPythonContext(preconditioner)
         self.ksp.setOperators(self.operator, self.operator)
-        self.ksp.setConvergenceTest(self.test)
+        self.ksp.setConvergenceTest(self._test_alone)
 
     def __call__(self, iterate: Iterate, acceptable: float = 0.0) -> float:
         """Return an estimate of |x - x*|_M at an iterate (collective).
@@ -110,27 +110,14 @@ class ErrorEstimate:
         self.lowest, self.is_accepted, self._acceptable = self.convexity, False, acceptable
 
     def test(self, ksp: PETSc.KSP, its: int, residual: float) -> PETSc.KSP.ConvergedReason:
-        """Return whether a solve H e = F by CG ends (the convergence test of KSP)."""
+        """Return whether Newton's solve H e = F ends (the convergence test of its KSP)."""
         reasons, (rtol, atol, divtol, _) = PETSc.KSP.ConvergedReason, ksp.getTolerances()
         if not np.isfinite(residual):
             return reasons.DIVERGED_NANORINF
-        is_alone = ksp == self.ksp
         if its == 0:
             self._first = residual
-        if (its > 0 and self._acceptable > 0) or (is_alone and (its > 0 or residual == 0)):
-            self.is_accepted = self._accepts(ksp, np.inf if is_alone else residual)
-            if self.is_accepted and not is_alone:
-                self._meet_eigenvalues(ksp)
-                self.is_accepted = self._accepts(ksp, residual)
-            is_above = 0 < self._acceptable < self.correction_norm
-            is_known = is_alone and (is_above or self.missing <= self.correction_norm)
-            if self.is_accepted or is_known:
-                return reasons.CONVERGED_HAPPY_BREAKDOWN
-            if is_above:
-                # No later iteration shows that the error is acceptable
-                self._acceptable = 0.0
-        if is_alone:
-            return reasons.ITERATING
+        elif self._acceptable > 0 and self._accepts_met(ksp, residual):
+            return reasons.CONVERGED_HAPPY_BREAKDOWN
         if residual <= atol:
             return reasons.CONVERGED_ATOL
         if residual <= rtol * self._first:
@@ -138,6 +125,31 @@ class ErrorEstimate:
                 self._meet_eigenvalues(ksp)
             return reasons.CONVERGED_RTOL
         return reasons.DIVERGED_DTOL if residual >= divtol * self._first else reasons.ITERATING
+
+    def _test_alone(self, ksp: PETSc.KSP, its: int, residual: float) -> PETSc.KSP.ConvergedReason:
+        """Return whether a solve for the estimate alone ends (the convergence test of its KSP)."""
+        reasons = PETSc.KSP.ConvergedReason
+        if not np.isfinite(residual):
+            return reasons.DIVERGED_NANORINF
+        if its == 0 and residual > 0:
+            return reasons.ITERATING
+        self.is_accepted = self._accepts(ksp, np.inf)
+        is_above = 0 < self._acceptable < self.correction_norm
+        if self.is_accepted or is_above or self.missing <= self.correction_norm:
+            return reasons.CONVERGED_HAPPY_BREAKDOWN
+        return reasons.ITERATING
+
+    def _accepts_met(self, ksp: PETSc.KSP, natural: float) -> bool:
+        """Return ``_accepts`` with the eigenvalues that CG has met so far.
+
+        Once e_k is above the acceptable error, no later iteration can show that x is acceptable.
+        """
+        if self._accepts(ksp, natural):
+            self._meet_eigenvalues(ksp)
+            self.is_accepted = self._accepts(ksp, natural)
+        elif self.correction_norm > self._acceptable:
+            self._acceptable = 0.0
+        return self.is_accepted
 
     def _meet_eigenvalues(self, ksp: PETSc.KSP) -> None:
         """Note the least Ritz value of the solve so far; k iterations take O(k^2).

@@ -51,7 +51,7 @@ class Environment:
         self.has_friction = self.obstacles.has_friction or bool(
             self.self_contact and self.self_contact.law.friction > 0
         )
-        # end positions and contact of the last step; None without friction
+        # end positions and contact of the last step; None without contact or friction
         self._ended: tuple[Positions, StepContact] | None = None
         self.touches = bool(model.penalties or self.self_contact)
         self.system_monitor: Callable[[Any, Any], None] | None = None

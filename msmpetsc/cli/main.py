@@ -156,7 +156,7 @@ def _is_petsc_option(word: str) -> bool:
 
 
 def _refuse_one_dash(ours: list[str], petsc: list[str]) -> None:
-    """Raise InputError for our options with a single dash, and for PETSc options outside ``run``."""
+    """Raise InputError for our options with one dash, and for PETSc options outside ``run``."""
     name = ours[0] if ours else ""
     # argparse handles -h and a missing command
     if name not in COMMANDS:

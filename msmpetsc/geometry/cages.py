@@ -36,7 +36,7 @@ LEAST_FILL = 1e-3
 FULL = 1 - 1e-9
 # accepted relative error of a cell count [-]; far below the lattice's own error
 TOLERANCE = 0.01
-# relative error of a body's mass above which a warning is logged [-]; far above rounding
+# relative error of a body's mass from which a warning is logged [-]; far above rounding
 MASS_TOLERANCE = 0.02
 
 

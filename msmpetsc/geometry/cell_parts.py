@@ -8,8 +8,8 @@ A slit narrower than a cell leaves several parts of the body in a cell. They are
 2. In a cell of several pieces, LINES x LINES lines run along each axis, and their crossings form a
    grid of points. Neighbouring points, and points and pieces, are joined if the line between them
    is inside the body. Joined pieces bound the same part.
-   If no line meets a piece, a ray inwards from it decides: the piece is joined with the piece that
-   the ray meets first. If it meets none, the piece is joined with a point seen from its middle.
+   If no line meets a piece, a ray runs inwards from it. The piece is joined with the first piece
+   that the ray meets. If there is none, it is joined with a point seen from the ray's middle.
 3. Parts of two cells meet in the common face if a piece crosses the face. They also meet if a line
    of step 2 crosses the face inside both parts. For two cells of a single part, the middle of an
    uncrossed face decides.

@@ -89,7 +89,7 @@ def _means(
     for value, mask in own_values:
         of_cells[mask.all(axis=1)] = value
         of_samples[mask[cut]] = value
-    # relative to a sample inside, so that equal samples have exactly their value as mean
+    # relative to a sample inside, so that equal samples give exactly their value
     first = np.take_along_axis(of_samples, shares.argmax(axis=1)[:, None], axis=1)
     of_cells[cut] = first[:, 0] + (shares * (of_samples - first)).sum(axis=1)
     return Constant(of_cells, of_samples)

@@ -185,8 +185,8 @@ def surface_part(table: OfBody, finder: Finder, lattice: Lattice) -> SurfacePart
 def refuse_open(table: OfBody, edges: SurfacePart, lattice: Lattice) -> None:
     """Raise InputError if the pressure on a part with open edges has no potential (collective).
 
-    The pressure has a potential if no open edge is free to leave a line along an axis, or a plane
-    of two axes that contains the edge. A closed part has no open edge.
+    A closed part has a potential. An open edge must be fixed, free along one axis only, or free in
+    a plane of two axes that contains the edge.
     """
     moves = (edges((~lattice.fixed).astype(float)) > 1e-9).any(axis=0)
     along = np.abs(edges.rest[1] - edges.rest[0])

@@ -23,7 +23,7 @@ from msmpetsc.scene.values import (
     Vector,
 )
 
-# largest ratio of stiffnesses or densities in a scene [-]; CG must converge
+# largest ratio of stiffnesses or densities in a scene [-]; so that CG converges
 MAX_CONTRAST = 1e6
 # tables that hold nodes: a node in several tables belongs to the first
 HOLDERS = ("pin", "anchor")

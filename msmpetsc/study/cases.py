@@ -143,7 +143,7 @@ def digest(file: Path, scene: Scene) -> str:
 def with_tables(
     case: Case, duration: float, every: int, scene: Scene, surface: bool = False
 ) -> Case:
-    """Return a case with overrides of the tables time, solver and output; verlet has no solver.
+    """Return a case with overrides of the tables time, output and, except for verlet, solver.
 
     duration : [s]
     every    : steps between stored frames

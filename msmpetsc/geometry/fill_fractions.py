@@ -119,7 +119,7 @@ def _sums_of_keys(keys: Indices, values: Rows) -> tuple[Indices, Rows]:
 
 @njit()
 def _sums_above(column: Indices, values: Rows) -> Rows:
-    """Return for each row the sum of the values (c, k) from it to the end of its column (c,)."""
+    """Return, for each row, the sum of values (c, k) from the row to the end of its column (c,)."""
     sums = values.copy()
     for c in range(len(column) - 2, -1, -1):
         if column[c] == column[c + 1]:

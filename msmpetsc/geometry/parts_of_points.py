@@ -52,7 +52,7 @@ class PartsOfPoints:
         A row is nan unless all of the node's parts are in cells of ``keys``.
 
         ijk  : (n, 8, 3) cells around each node
-        part : (n, 8) part of which the node is a corner in each cell, -1 if there is none
+        part : (n, 8) part of each cell that has the node as a corner, -1 if there is none
         """
         import igl
 

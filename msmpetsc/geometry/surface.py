@@ -115,7 +115,7 @@ def examine(surface: Surface) -> SurfaceReport:
 def check_encloses(surface: Surface, report: SurfaceReport) -> list[str]:
     """Return a line for each fault that makes the inside of a surface doubtful, with its remedy.
 
-    The flatness is measured along the principal axes, so that a tilted sheet counts as flat, too.
+    The flatness is measured along the principal axes, so that a tilted sheet also counts as flat.
     A closed surface is also flat if its mean thickness 2 |volume| / area is at most FLAT of its
     longest side.
 

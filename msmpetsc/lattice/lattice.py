@@ -59,7 +59,7 @@ def _springs_of_solid(
 class Lattice:
     """This rank's part of a lattice. Local numbers begin with the ``owned`` nodes; ghosts follow.
 
-    table       : global node numbers by grid key; ``table.first`` is that of the first owned node
+    table       : global node numbers by grid key; the first owned node has ``table.first``
     nodes       : (l, 3) rest positions [m]
     ghosts      : (l - owned,) global numbers of the ghost nodes
     mass        : (owned,) [kg]
@@ -166,7 +166,7 @@ class Lattice:
         )
 
     def pin(self, where: Mask) -> "Lattice":
-        """Return this lattice with the nodes (l,) or components (l, 3) ``where`` fixed, too."""
+        """Return this lattice with further nodes (l,) or components (l, 3) ``where`` fixed."""
         return replace(self, fixed=self.fixed | where.reshape(len(where), -1))
 
 

@@ -92,7 +92,7 @@ def _newest_checkpoint(run: Result) -> tuple[int, Checkpoint, list[str]] | None:
 
 
 def newest_slot(steps: Indices) -> int | None:
-    """Return the slot of the newest checkpoint, or None; ``steps`` (2,) are those of the slots."""
+    """Return the slot of the newest checkpoint from the steps (2,) of both slots, or None."""
     slot = int(np.argmax(steps))
     return slot if steps[slot] >= 0 else None
 

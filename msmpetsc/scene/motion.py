@@ -214,7 +214,7 @@ class Force(Table):
 
 
 class SurfaceLoad(Table):
-    """A load on surface triangles, chosen by a region that contains their centroids."""
+    """A load on the surface triangles of a region, chosen by their centroids or their group."""
 
     region: Region = Field(
         description="the triangles of the surface that the load acts on, by their centroids or by "

@@ -70,7 +70,7 @@ class Time(Table):
 
 
 def one_state(data: Any) -> Any:
-    """Return the unchecked data of a scene, with missing step and duration added if it is constant.
+    """Return the unchecked data of a scene; add missing step and duration to a constant scene.
 
     A static scene with constant loads has a single state. If only step or duration is given, the
     other is equal to it; if both are absent, both are 1 s.

@@ -98,7 +98,7 @@ def findings() -> Iterator[Finding]:
 
 
 def probed(code: str, *launcher: str) -> tuple[str, str]:
-    """Run a probe in a Python of its own; return its state, and its output or failure.
+    """Run a probe in its own Python process; return its state, and its output or failure.
 
     launcher : words before the Python command, for example "mpiexec", "-n", "2"
     """

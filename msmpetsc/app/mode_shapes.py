@@ -48,7 +48,7 @@ def refuse_existing(request: RunRequest) -> None:
 
 
 def _write(comm: MPI.Intracomm, plan: "RunPlan", model: "Model", modes: "Modes") -> None:
-    """Write the state that vibrates as frame 0, then a frame for each shape (collective).
+    """Write the base state as frame 0, then a frame for each shape (collective).
 
     Raises InputError if the file cannot be written.
     """

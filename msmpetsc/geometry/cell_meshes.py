@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 # triangles (f, 3) by the name of their group
 Groups = dict[str, Indices]
 
-# most labels of an array [-]; an array with more numbers its cells, and names no groups
+# most labels of an array of groups [-]; an array with more labels numbers the cells
 MOST_LABELS = 1000
 # most lines asked for past the end of a text [-]; readers of intact files ask for few
 MOST_LINES_PAST_END = 100

@@ -87,8 +87,8 @@ def _to_cells(points: Sequence[Positions], cages: Cages) -> tuple[Indices, Indic
 def cells_at(cages: Cages, body: int, points: Positions) -> tuple[Indices, Rows]:
     """Return the key (n,) of the cell of each point (n, 3) [m], and coordinates in it (n, 3).
 
-    In a cell with several parts it is the copy for the part that holds the point; only rank 0 finds
-    this copy. The points lie on a body's surface or inside it.
+    In a cell with several parts, the key names the copy for the part that holds the point. Only
+    rank 0 finds this copy. The points lie on a body's surface or inside it.
     """
     at, parts = cages.grids.grids[body].to_cells(points), cages.parts[body]
     ijk = np.floor(at).astype(np.int64)

@@ -39,9 +39,10 @@ class Style:
 class Still:
     """A picture to draw of a frame.
 
-    index   : number of the frame
-    caption : two lines of text
-    cut     : cells to show; None for the whole surface
+    index    : number of the frame
+    overlays : obstacles and force arrows
+    caption  : two lines of text
+    cut      : cells to show; None for the whole surface
     """
 
     index: int

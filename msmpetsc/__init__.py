@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-# FROM again, as imports that a type checker can follow
+# the public names of FROM, for type checkers
 if TYPE_CHECKING:
     from msmpetsc.app.start import Simulation as Simulation
     from msmpetsc.app.start import frames as frames

@@ -61,7 +61,7 @@ USUAL_SIDES = 1e-3, 20.0
 
 @dataclass(frozen=True)
 class Model:
-    """A scene made ready to step. Arrays hold this rank's rows; the surfaces are on rank 0 only.
+    """A scene ready for its first step. Arrays hold this rank's rows; surfaces are on rank 0 only.
 
     surface     : surfaces of all bodies, joined in the scene's order
     embedding   : this rank's rows of W (geometry.embedding); None if the scene stores no surface
@@ -173,9 +173,9 @@ class Geometry:
         return nearest_of_body(self.bodies, self.cages, self.topology)
 
     def outside(self, nodes: Positions) -> Floats | None:
-        """Return the distance (l,) [m] of nodes (l, 3) outside their body; None with whole cells.
+        """Return the distance (l,) [m] from nodes (l, 3) to their body, 0 for a node inside.
 
-        Collective.
+        Return None with whole cells, where the lattice is the body (collective).
         """
         if not self.cages.is_weighted:
             return None
@@ -191,8 +191,8 @@ def build_model(
 ) -> Model:
     """Build the model of a scene (collective). Raises InputError on all ranks.
 
-    geometry   : of the scene's meshes and cages; built here if None
-    read_state : reader of the states that ``start.from`` names; not needed without
+    geometry   : geometry of the scene's meshes and cages; built here if None
+    read_state : reader of the state that ``start.from`` names; None if the scene has no such key
     """
     geometry = geometry or Geometry(comm, scene)
     bodies, cages = geometry.bodies, geometry.cages
@@ -352,7 +352,7 @@ def fill_cages(bodies: Sequence[BodySurface], scene: Scene) -> Cages:
 def _anchors(
     tables: Iterable[OfBody], lattice: Lattice, components: Regions, holders: Holders
 ) -> list[Anchor]:
-    """Return the anchors (collective). A component follows its pin, else its first anchor.
+    """Return the anchors, without components that a pin or an earlier anchor holds (collective).
 
     components : fixed components (l, 3) in the region of each table
 

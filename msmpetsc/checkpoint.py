@@ -1,7 +1,7 @@
 """Checkpoints: the positions, velocities and counters that the next step of a run depends on.
 
-Solver histories are not part of a checkpoint. A run clears them at each step that may be a
-checkpoint (solve.simulate), so that a resumed run equals an uninterrupted run bit by bit.
+Solver histories are not part of a checkpoint. A run clears them at each step at which a checkpoint
+may be written (solve.simulate). So a resumed run equals an uninterrupted run bit by bit.
 """
 
 import math
@@ -21,8 +21,8 @@ from msmpetsc.errors import InputError
 MAX_VALUE = 1e60
 # largest counter; a double holds every whole number up to it
 MAX_COUNT = 2**53
-# number of a run's last step plus the number stored for its state; no run resumes
-# there, since a longer run would remember earlier steps
+# number stored for the state after a run's last step n, plus n; no run resumes from
+# this state, because an uninterrupted longer run would keep its histories
 AT_END = -2
 Range = tuple[float, float]
 COUNT: Range = (0, MAX_COUNT)
@@ -82,7 +82,7 @@ class Checkpoint:
 
     def _like(self, name: str, value: Any, bounds: Range) -> Any:
         """Return the stored number of a name, as the type of ``value``, which is its default."""
-        # a quantity that may be unknown is nan, which no range contains
+        # the default nan stands for an unknown quantity, which no range contains
         if isinstance(value, float) and math.isnan(value):
             return self.numbers.get(name, value)
         least, most = bounds

@@ -1,4 +1,4 @@
-"""Communication between ranks: shared errors, work on rank 0, rows sent to the owners of keys."""
+"""Communication between ranks: shared errors, work on rank 0, exchange of rows."""
 
 from __future__ import annotations
 
@@ -22,9 +22,10 @@ T = TypeVar("T")
 
 @contextmanager
 def together(comm: MPI.Comm) -> Iterator[None]:
-    """Raise on all ranks the first rank's MsmpetscError or MemoryError, if any (collective).
+    """Run a block; if it raises MsmpetscError or MemoryError, raise it on all ranks (collective).
 
-    The block may contain no collective call, as a rank that fails leaves it early.
+    If several ranks fail, the error of the lowest rank is raised. The block must not contain a
+    collective call, because a rank that fails would not reach it.
     """
     error = None
     try:
@@ -38,7 +39,7 @@ def together(comm: MPI.Comm) -> Iterator[None]:
 
 
 def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T | None:
-    """Return the value of a function called on rank 0 only, None elsewhere (collective).
+    """Call a function on rank 0 only; return its value there, None elsewhere (collective).
 
     If the function raises an expected error, all ranks raise it.
     """
@@ -50,9 +51,9 @@ def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T | None:
 
 
 class Stop:
-    """The signal that asks this process to stop; 0 if there is none.
+    """The number of the signal that asks this process to stop; 0 if there is none.
 
-    The number is a class attribute, as signals belong to the whole process.
+    The number is a class attribute, because signals belong to the whole process.
     """
 
     signal = 0
@@ -64,7 +65,7 @@ class Stop:
 
 
 class Route:
-    """Rows sent to their destination ranks by Alltoallv, and answers sent back in the same order.
+    """Exchange of rows by Alltoallv: send rows to other ranks, and answers back in the same order.
 
     destination : rank (n,) of each row
     """

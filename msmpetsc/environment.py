@@ -17,8 +17,8 @@ from msmpetsc.contact.surface.pairs import CandidateCache, ContactSearch, Contac
 from msmpetsc.contact.surface.surface_contact import SurfaceContact
 from msmpetsc.elasticity.energy import Elasticity
 
-# ratio of the normal force at a step's end to the force that limited friction; beyond
-# it, in either direction, the step is solved again with the new limit
+# largest factor between the friction limit used in a step and mu N at its end [-];
+# beyond it the step is solved again with the new limit
 LAG_LIMIT = 4.0
 
 
@@ -26,14 +26,14 @@ class Environment:
     """Forces, anchors, obstacles and surface contact of a model during a step.
 
     Positions (l, 3) [m] are local and include ghosts. ``time`` [s] is the end of a step and
-    ``time_step`` [s] its length. ``sides`` (o, l) are the sides of thin obstacles that nodes
-    are on (NodeObstacles).
+    ``time_step`` [s] its length. ``sides`` (o, l) tells on which side of each thin obstacle a node
+    is (NodeObstacles).
 
     damping     : mass-proportional damping rate [1/s]
     retardation : viscosity over stiffness [s]
     contacts    : surface contacts of the step begun last; None without surface contact
     touches     : whether the model has penalty obstacles or surface contact
-    system_monitor : called with the first iterate of each solve and its Jacobian; None for no call
+    system_monitor : function called with the first iterate of each solve and its Jacobian, or None
     """
 
     def __init__(self, model: Model):
@@ -51,7 +51,7 @@ class Environment:
         self.has_friction = self.obstacles.has_friction or bool(
             self.self_contact and self.self_contact.law.friction > 0
         )
-        # end positions and contact of the last step, if friction continues from it
+        # end positions and contact of the last step; None without contact or friction
         self._ended: tuple[Positions, StepContact] | None = None
         self.touches = bool(model.penalties or self.self_contact)
         self.system_monitor: Callable[[Any, Any], None] | None = None
@@ -62,12 +62,12 @@ class Environment:
         return Elasticity(self.lattice)
 
     def events(self) -> list[float]:
-        """Return the times [s] at which a load or path starts, stops or changes its slope."""
+        """Return the times [s] at which a load or a motion starts, stops or changes its slope."""
         kinks = [time for moving in self.moving for time in moving.path.times.tolist()]
         return kinks + [time for timed in (*self.forces.all, *self.moving) for time in timed.events]
 
     def is_same(self, begin: float, end: float) -> bool:
-        """Return whether loads, anchors and obstacles are equal at two times [s]."""
+        """Return whether loads, anchors and obstacles are the same at two times [s]."""
 
         def at(time: float) -> list[Any]:
             loads: list[Any] = [tuple(load.state_at(time)) for load in self.forces.all]
@@ -86,11 +86,11 @@ class Environment:
         sides: Indices | None,
         end: Positions | None = None,
     ) -> StepContact | None:
-        """Return the contact of the step from q, with friction; None if there is none (collective).
+        """Return the contact of a step from q, with friction; None without contact (collective).
 
         last : positions (l, 3) [m] one step before q, for a two-step method
-        end  : positions (l, 3) [m] at which an earlier solve of this step ended; the normal forces
-            there then limit friction
+        end  : positions (l, 3) [m] at which an earlier solve of this step ended, whose normal
+            forces then limit friction
         """
         previous = self._previous_contact(q)
         surface = None
@@ -102,9 +102,9 @@ class Environment:
         return StepContact(states, self.lattice.owned, surface) if states or surface else None
 
     def begin_contacts(self, q: Positions, time: float, time_step: float) -> None:
-        """Begin a step at q with candidate pairs of the surface (collective).
+        """Search the candidate pairs of the surface for a step from q that ends at ``time``.
 
-        If contacts are few, only pairs near them are candidates.
+        If contacts are few, only pairs near them are candidates (collective).
         """
         if self.self_contact:
             begin = max(time - time_step, 0.0)
@@ -140,5 +140,8 @@ class Environment:
             self.contacts = ContactSearch(self.self_contact, 0.0, 0.0)
 
     def touch(self, q: Positions, time: float) -> ContactSummary:
-        """Return count and distance of surface contacts at q and a time [s] (collective)."""
+        """Return number, least distance and energy of surface contacts at q (collective).
+
+        time : [s]
+        """
         return self.contacts.touch(q, time) if self.contacts else ContactSummary()

@@ -4,7 +4,7 @@ import difflib
 from collections.abc import Iterable
 from errno import EDQUOT, EFBIG, ENOSPC
 
-# exit statuses of the command line; a run that a signal stops has that of app.signals
+# exit statuses of the command line; app.signals has the statuses of stopped runs
 STATUS_BUG, STATUS_REFUSED, STATUS_FAILED, STATUS_INTERRUPTED = 1, 2, 3, 130
 
 

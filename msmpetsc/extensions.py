@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 
 class Extensions(Generic[T]):
-    """Registry of the extensions of a kind by name; registered values precede installed ones.
+    """Registry of the extensions of a kind; a registered name hides an installed extension.
 
     kind  : "force", "obstacle" or "preset"
     group : of the entry points, for example "msmpetsc.forces"
@@ -50,7 +50,10 @@ class Extensions(Generic[T]):
         return [*self._registered, *(point.name for point in entry_points(group=self.group))]
 
     def find(self, name: str) -> T:
-        """Return the value of a name, importing it if it is installed. Raises InputError."""
+        """Return the value of a name; import an installed extension.
+
+        Raises InputError if the name is unknown, or the extension cannot be imported.
+        """
         if name in self._registered:
             return self._registered[name]
         points = entry_points(group=self.group, name=name)

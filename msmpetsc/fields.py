@@ -16,8 +16,8 @@ class Field(NamedTuple):
     """A dataset of a result file.
 
     dtype     : numpy name of the type written; a reader accepts any size of this kind
-    shape     : numbers and letters (scripts/docs/pages/reference/result-file.md); a letter has a
-                single value in a file
+    shape     : length of each axis, a number or a letter; a letter has the same value in all
+                datasets of a file (scripts/docs/pages/reference/result-file.md)
     unit      : "1" for a dimensionless quantity
     long_name : meaning in a few words
     at_rest   : name of the dataset with the values at rest, "" if there is none
@@ -65,8 +65,8 @@ class Frame:
     iterations : int
         Iterations of the nonlinear solver (SNES), or explicit substeps.
 
-    ``FRAME_FIELDS`` has shape, unit and meaning of all attributes. From ``reaction`` on, an
-    attribute is None if the scene does not store it.
+    ``FRAME_FIELDS`` has shape, unit and meaning of all attributes except ``index``. From
+    ``reaction`` on, an attribute is None if the scene does not store it.
     """
 
     index: int
@@ -154,7 +154,7 @@ class Frame:
     ] = None
 
     def with_own_positions(self) -> "Frame":
-        """Return the frame with a copy of the positions, which the next step still needs."""
+        """Return the frame with a copy of the positions, so that its receiver may change them."""
         return replace(self, position=self.position.copy())
 
     def __repr__(self) -> str:

@@ -1,4 +1,4 @@
-"""Log and failures of all ranks: rank 0 writes the log, and a failure on some ranks ends all."""
+"""Log and failures on several ranks: rank 0 writes the log; a failure on some ranks ends all."""
 
 import logging
 import sys
@@ -23,7 +23,11 @@ TIMED = "msmpetsc: %(levelname)s [%(relativeCreated).0f ms]: %(message)s"
 def logged_on_root(
     comm: "MPI.Comm", level: int = logging.INFO, timed: bool = False
 ) -> Iterator[None]:
-    """Write the log of rank 0 only to stderr, from a level on, if ``timed`` with milliseconds."""
+    """Write rank 0's log, and no other rank's, to stderr during the block.
+
+    level : least level of the lines shown
+    timed : whether each line has the time since the start [ms]
+    """
     log = logging.getLogger("msmpetsc")
     handlers, previous_level = log.handlers, log.level
     logging.addLevelName(logging.WARNING, "warning")
@@ -45,15 +49,15 @@ def ending_together(
     extra: str = "run",
     abandon: Callable[[], None] = lambda: None,
 ) -> Iterator[None]:
-    """Pass on an error that all ranks raise; abort all ranks at an error of some (collective).
+    """Raise an error of the block if all ranks fail, and abort all ranks if only some fail.
 
     Without the abort the other ranks would wait for ever. Enter this context inside each context
-    whose exit is collective.
+    whose exit is collective (collective).
 
-    extra   : the extra to name for a missing package that several extras bring
+    extra   : extra named in the message if several extras bring a missing package
     abandon : called on a failing rank before the abort, which skips all cleanup
     """
-    # a communicator of its own, so that its barrier matches no other call
+    # an own communicator, so that the barrier matches no other call
     meeting = comm.Dup() if comm.size > 1 else None
     try:
         yield
@@ -77,7 +81,7 @@ def ending_together(
 def _all_fail(meeting: "MPI.Comm") -> bool:
     """Return whether all ranks fail within PATIENCE.
 
-    The limit grows with the rank, so that a low rank reports the error and ends the other ranks.
+    The time limit grows with the rank, so that the lowest failing rank reports the error.
     """
     barrier = meeting.Ibarrier()
     until = time.monotonic() + PATIENCE * (1 + meeting.rank / meeting.size)

@@ -20,7 +20,7 @@ CHECKPOINT_TIME = 0.01
 
 
 class Checkpoints:
-    """Write a run's checkpoints at the first and last step, when due, and at a signal.
+    """Writer of a run's checkpoints: at the first and last step, when due, and at a signal.
 
     every  : frames between checkpoints; None for an interval that takes CHECKPOINT_TIME of the run
     signal : number of the signal that ended the run before its last step; 0 if there was none
@@ -32,8 +32,8 @@ class Checkpoints:
         self.simulation = simulation
         self.every = every
         self.signal = 0
-        # of the last checkpoint: its step, the frames since then, the time of its end,
-        # and the interval to the next checkpoint [s]
+        # step of the last checkpoint, frames since it, time at which it was written,
+        # and interval until the next checkpoint [s]
         self._written = -1
         self._frames = 0
         self._ended = perf_counter()

@@ -42,7 +42,7 @@ def checked_file(given: str | os.PathLike[str]) -> Path:
 def refuse_other_format(
     option: str, path: str | os.PathLike[str] | None, endings: tuple[str, ...]
 ) -> None:
-    """Raise InputError for a file name with another ending than ``endings``."""
+    """Raise InputError for a file name that has none of the ``endings``."""
     if path is not None and Path(path).suffix.lower() not in endings:
         names = " or ".join(f"*{ending}" for ending in endings)
         raise InputError(f"{option} {path}: the file must be named {names}")

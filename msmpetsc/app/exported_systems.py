@@ -19,7 +19,7 @@ from msmpetsc.solve.nonlinear.functional import Iterate
 from msmpetsc.solve.nonlinear.jacobian import Jacobian
 from msmpetsc.solve.petsc.library import petsc_errors
 
-# |F - H y| over |F| at which our multigrid is timed, and that of the correction [-]
+# relative residuals |F - H y| / |F| of the timed solve and of the stored correction [-]
 TIMED, EXACT = 1e-8, 1e-12
 
 
@@ -29,7 +29,7 @@ class ExportedSystems:
     A folder step_N gets hessian.bin, residual.bin, coordinates.bin, rigid_modes.bin (six
     vectors), correction.bin and system.json. Rows are by node: x, y and z of a node in sequence.
 
-    steps : numbers of the steps, from 1, that are not written yet
+    steps : numbers of the steps, from 1, still to be written
 
     Raises InputError if the folder cannot be written.
     """
@@ -92,9 +92,10 @@ def _write(comm: MPI.Intracomm, path: Path, objects: Sequence[PETSc.Object]) -> 
 
 
 def _solved(now: Iterate, jacobian: Jacobian, y: PETSc.Vec) -> dict[str, Any]:
-    """Solve H y = F to EXACT by CG with our multigrid; return the cost to TIMED (collective).
+    """Solve H y = F to EXACT by CG with our multigrid; return the cost of a solve to TIMED.
 
-    The step's own CG may have another preconditioner, and counts its work.
+    This is a second CG, because the step's CG may have another preconditioner and counts its
+    iterations (collective).
     """
     multigrid = jacobian.multigrid()
     ksp = PETSc.KSP().create(jacobian.comm)
@@ -105,7 +106,7 @@ def _solved(now: Iterate, jacobian: Jacobian, y: PETSc.Vec) -> dict[str, Any]:
     ksp.getPC().setType(PETSc.PC.Type.PYTHON)
     ksp.getPC().setPythonContext(multigrid)
     rough, cost = y.duplicate(), {}
-    # Timed second, when all kernels are loaded
+    # the timed solve comes second, when all kernels are loaded
     for rtol, solution in ((EXACT, y), (TIMED, rough)):
         multigrid.forget()
         began = perf_counter()

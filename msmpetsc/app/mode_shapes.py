@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from msmpetsc.build import Model
     from msmpetsc.solve.natural_modes import Modes
 
-# Greatest displacement of a shape in the file, over the longest side [-]; well visible
+# largest displacement of a stored shape over the longest side [-]; well visible
 AMPLITUDE = 0.1
 
 
 def find_modes(comm: MPI.Intracomm, request: RunRequest, count: int) -> "Modes":
-    """Return the lowest modes of a request's scene; write their shapes if it has an output.
+    """Return the lowest modes of a request's scene; write their shapes if it names an output.
 
-    All ranks call it together. Raises InputError or StepFailed.
+    Collective. Raises InputError or StepFailed.
     """
     with options_given(comm, request):
         from msmpetsc.app.running import described_model, prepare
@@ -48,7 +48,10 @@ def refuse_existing(request: RunRequest) -> None:
 
 
 def _write(comm: MPI.Intracomm, plan: "RunPlan", model: "Model", modes: "Modes") -> None:
-    """Write the state as frame 0, then a frame for each shape (collective). Raises InputError."""
+    """Write the base state as frame 0, then a frame for each shape (collective).
+
+    Raises InputError if the file cannot be written.
+    """
     from msmpetsc.app.running import open_output, write_companions
     from msmpetsc.lattice.embedded_surface import EmbeddedPoints
     from msmpetsc.results.writer import write_model

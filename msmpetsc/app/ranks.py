@@ -41,8 +41,8 @@ class OneProcess:
 def world(started: bool = False) -> "MPI.Comm":
     """Return the communicator of all ranks, or a substitute for a single process.
 
-    started : whether to start MPI in any case. Otherwise MPI, which takes 0.1 s to start, is
-        started only in a process of a launcher, and the substitute serves if the start fails.
+    started : whether to start MPI in any case. If False, start it only in a process of a launcher,
+        because a start takes 0.1 s, and return the substitute if the start fails.
     """
     launched = bool(LAUNCHED & os.environ.keys())
     if not (started or launched):
@@ -50,7 +50,8 @@ def world(started: bool = False) -> "MPI.Comm":
     try:
         with _variables({} if launched else ALONE):
             from mpi4py import MPI
-    # MPI is missing or broken, for example on a login node: only `run` reports that
+    # MPI is missing or broken, for example on a login node: only commands that run on
+    # ranks report that
     except (ImportError, RuntimeError):
         if started:
             raise
@@ -91,5 +92,5 @@ def environment(alone: bool = False) -> dict[str, str]:
     inherited = {
         name: value for name, value in os.environ.items() if not name.startswith(VARIABLES_OF_MPI)
     }
-    # a thread on each rank, as more threads than cores slow all ranks
+    # one thread on each rank, because more threads than cores slow all ranks
     return {"OMP_NUM_THREADS": "1"} | OVERSUBSCRIBED | (ALONE if alone else {}) | inherited

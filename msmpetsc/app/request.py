@@ -1,7 +1,7 @@
 """The table of the options of a run.
 
-It defines the keywords of ``msmpetsc.run`` with their help, the options of ``msmpetsc run``, and
-the table of options in the documentation (scripts/docs/pages/reference/command-line.md).
+It defines the keywords of ``msmpetsc.run``, the options of ``msmpetsc run``, their help, and the
+table of options in the documentation (scripts/docs/pages/reference/command-line.md).
 """
 
 # ruff: noqa: RUF009
@@ -37,8 +37,8 @@ class Option(NamedTuple):
     """Help and command line syntax of a field of the request.
 
     short    : alternative name with a single dash, if any
-    python   : whether only Python has the option, or the command line has another form of it
-    keywords : further keywords of its argument for argparse
+    python   : whether the option is for Python only, or takes another form on the command line
+    keywords : further keywords of the argument for argparse
     """
 
     help: str

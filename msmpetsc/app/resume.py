@@ -52,7 +52,9 @@ IGNORED = {"text", "folder", "title", "picture"}
 def earlier_run(
     comm: MPI.Comm, resume: str | PathLike[str] | None, may_start: bool
 ) -> Earlier | None:
-    """Return the run to continue, None to run from the start (collective). Raises InputError.
+    """Return the earlier run to continue, or None to run from the start (collective).
+
+    Raises InputError if the file is no result.
 
     may_start : whether the run may start from its scene if the file does not exist
     """
@@ -72,8 +74,8 @@ def kept_options(earlier: Earlier, given: Sequence[str]) -> list[str]:
 
     given : words of this run's PETSc options
 
-    Raises InputError for an option that could do more than choose a solver, as the file may come
-    from an untrusted source.
+    Raises InputError for an option that could do more than choose a solver, because the file may
+    come from an untrusted source.
     """
     kept: list[str] = []
     for name, value in _stored(earlier).items():
@@ -123,7 +125,7 @@ def stored_scene(earlier: Earlier, changes: list[str]) -> Scene:
 
 
 class Resumed:
-    """A run that continues an earlier run with the same scene and options, or with ``force``.
+    """A run that continues an earlier run; its scene and options may differ only with ``force``.
 
     differs : a line for each scene key or PETSc option that has changed
     """
@@ -183,7 +185,7 @@ class Resumed:
             rows["lattice/mass"] = lattice.mass
         refuse_changed_lattice(comm, self.earlier.path, rows)
         if not self.differs:
-            # a painted region has its points from a file of its own
+            # a painted region may take its points from a file, which may have changed
             pinned = {"lattice/pinned": lattice.global_numbers[own][lattice.pinned[own]]}
             words = "a file that a pin names has changed"
             refuse_changed_lattice(comm, self.earlier.path, pinned, words)
@@ -203,7 +205,7 @@ class Resumed:
             if kept > self.earlier.finished:
                 raise InputError(f"{path} is damaged: it lacks frames from before its checkpoint")
             on_root(comm, lambda: refuse_unlike_frame(path, kept - 1))
-        # later frames are of the unchanged scene
+        # frames after the checkpoint belong to the scene before its change
         if self.differs:
             file.keep(kept)
         if saved is None:

@@ -54,7 +54,7 @@ class RunPlan:
     """The scene of a run, the earlier run that it continues, and the time of its beginning.
 
     began  : perf_counter at the beginning of preparation [s]
-    logged : time in each logged event of the process until then [s]; empty without ``measure``
+    logged : time in each logged event of the process before that [s]; empty without ``measure``
     """
 
     request: RunRequest
@@ -100,8 +100,8 @@ def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -
 def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> tuple[Checkpoints, Cost, StepFailed | None]:
     """Take the steps and write their frames and checkpoints (collective).
 
-    Returns the checkpoints with the signal that stopped the run, the cost, and the failure of a
-    step that ended the run.
+    Returns the checkpoints, which have the signal that stopped the run, the cost, and the failed
+    step that ended the run, or None.
     """
     failure, request = None, plan.request
     systems = None
@@ -134,7 +134,7 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> tuple[Checkpoints, Cost, S
                     signals.begin(file.abandon)
                     for frame in checkpoints.steps():
                         with cost.of_output():
-                            # a resumed file has the frames before its checkpoint
+                            # a resumed file has frames up to its checkpoint already
                             if frame is not None and next(numbers) >= file.finished:
                                 file.append(frame)
                                 on_root(comm, xdmf.update)
@@ -181,7 +181,10 @@ def finish(
 def lines_of_options(
     comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None
 ) -> list[str]:
-    """Return the PETSc options of a run, or of a preset without a scene (collective)."""
+    """Return the PETSc options of a run, or of a preset if no scene is given, as lines.
+
+    Collective.
+    """
     refuse_early(comm)
     choose(comm, request.device)
     if request.scene or earlier:
@@ -219,7 +222,7 @@ def read_scene(request: RunRequest, earlier: Earlier | None) -> Scene:
 def attributes_of(comm: MPI.Intracomm, scene: Scene, request: RunRequest) -> dict[str, Any]:
     """Return the attributes of the result file: versions, options, ranks, command and scene."""
     options = PETSc.Options().getAll().items()
-    # relative paths of a scene without a file start from its folder
+    # a scene without a file has its paths relative to its folder
     file = request.file or scene.folder / "scene"
     return {
         "msmpetsc_version": __version__,
@@ -238,7 +241,7 @@ def attributes_of(comm: MPI.Intracomm, scene: Scene, request: RunRequest) -> dic
 def open_output(
     comm: MPI.Intracomm, plan: RunPlan, more: Mapping[str, Any] | None = None
 ) -> ResultFile:
-    """Open the result file for writing, new or of the resumed run (collective).
+    """Open a new result file, or the file of the resumed run, for writing (collective).
 
     more : further attributes of the file
     """
@@ -251,7 +254,7 @@ def open_output(
 
 
 def described_model(comm: MPI.Intracomm, plan: RunPlan) -> Model:
-    """Return the model after logging its size and checking it for a resume (collective)."""
+    """Build the model, log its size, and check it against a resumed run's lattice (collective)."""
     model = build_model(comm, plan.scene, None, partial(end_of_run, comm, plan.scene.folder))
     log_model(comm, model)
     warn_of_long_steps(plan.scene, model)

@@ -25,7 +25,7 @@ class Signals:
 
     def __init__(self, comm: MPI.Comm):
         self.comm = comm
-        # called before the run ends at once; None until the first step
+        # function called before a second SIGINT ends the run; None until the first step
         self._abandon: Callable[[], None] | None = None
         self._previous: dict[int, Any] = {}
 
@@ -40,7 +40,10 @@ class Signals:
         Stop.signal = 0
 
     def begin(self, abandon: Callable[[], None]) -> None:
-        """Let a SIGINT stop the run orderly from now on, and a second SIGINT call ``abandon``."""
+        """Let a SIGINT stop the run after its current iteration, from now on.
+
+        A second SIGINT calls ``abandon`` and ends the process.
+        """
         self._abandon = abandon
 
     def _handle(self, number: int, _: FrameType | None) -> None:

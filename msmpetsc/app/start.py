@@ -1,4 +1,4 @@
-"""The Python interface of runs. Modules that use PETSc are imported after it has its options."""
+"""The Python interface of runs. Modules that import PETSc are imported once it has its options."""
 
 import atexit
 import inspect
@@ -160,8 +160,8 @@ def frames(
 class Simulation:
     """A scene for several runs that share cages, embedding and the network of springs.
 
-    These are kept as long as the tables of meshes and cages do not change. Material, loads,
-    starts and times may change from run to run. All methods are collective.
+    A run builds these anew if the tables of meshes or cages have changed. Material, loads, starts
+    and times may change from run to run. All methods are collective.
 
     Attributes
     ----------
@@ -252,7 +252,7 @@ class Simulation:
         """Yield the frames of a run and close its resources at the end (collective)."""
         with ExitStack() as resources:
             with self._guarded():
-                # A process that ends PETSc first closes the runs that it has left open.
+                # At exit, a process first closes the runs left open, then ends PETSc.
                 atexit.register(resources.close)
                 resources.callback(atexit.unregister, resources.close)
                 steps = self._begin(scene, resources)
@@ -270,7 +270,7 @@ class Simulation:
         from msmpetsc.solve.petsc.device import AIJCUSPARSE, OPTION, choose
 
         words = [*self._words, f"-{OPTION}", AIJCUSPARSE] if self.device == "cuda" else self._words
-        # whether no other simulation is under way; + drops counts of zero
+        # whether no other simulation is under way; the plus drops counts of zero
         alone = not +presets.in_use
         if words and not alone:
             raise InputError(
@@ -295,7 +295,7 @@ class Simulation:
     def _guarded(self) -> Iterator[None]:
         """Log warnings on rank 0 and end all ranks at a failure in the block (collective).
 
-        The block is a step, not the caller's loop, whose errors are its own.
+        The block contains a step, but not the caller's loop: an error there ends no rank.
         """
         # a step reports overflow itself
         with (

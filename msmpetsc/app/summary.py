@@ -1,4 +1,4 @@
-"""The log of a run, from its bodies and counts to its files, and the record of its cost."""
+"""The log lines of a run about its model, its end and its files, and the record of its cost."""
 
 import json
 import platform
@@ -62,10 +62,10 @@ def log_model(comm: MPI.Intracomm, model: Model) -> None:
 
 
 def warn_of_long_steps(scene: Scene, model: Model) -> None:
-    """Warn if the time step exceeds the slowest period of any body: implicit steps damp it away.
+    """Warn if the time step exceeds the longest vibration period of all bodies.
 
-    The period is that of a bending bar with the body's longest and shortest side, which is an
-    upper estimate for most bodies.
+    Implicit steps of that length damp the vibration away. The period of a body is estimated as the
+    period of a bending bar with the body's longest and shortest side, mostly an upper estimate.
     """
     time = scene.time
     if time.integrator not in ("implicit-euler", "bdf2") or time.error is not None:
@@ -139,7 +139,7 @@ class Cost:
         self.output += perf_counter() - began
 
     def count(self, frame: Frame) -> None:
-        """Add the steps since the previous frame."""
+        """Add the time and products of the steps since the previous frame."""
         self.stepping += frame.wall_time
         self.products += frame.products
 

@@ -1,9 +1,9 @@
 """Cache of compiled kernels on disk, for all processes that run the same sources.
 
-It replaces numba's cache, which checks a kernel's own file alone for changes, fails in read-only
+It replaces numba's cache, which checks only the kernel's own file for changes, fails in read-only
 directories, and lets two processes mix up their files.
 
-- The name of a directory has a digest of all sources with kernels.
+- The name of a directory contains a digest of all sources with kernels.
 - The name of a file is a digest of the kernel, its argument types and the constants that it reads.
 """
 
@@ -43,8 +43,8 @@ def _digest_of_sources() -> str:
     return hashlib.sha256(b"".join(kernels) + versions.encode()).hexdigest()[:16]
 
 
-# Read before the kernels are imported: an update of the package during a run must not
-# store kernels of the old sources under the new digest.
+# Computed before kernels are imported: if the package is updated during a run, kernels
+# of the old sources must not be stored under the new digest.
 SOURCES = _digest_of_sources()
 
 
@@ -110,7 +110,7 @@ def _file(name: str) -> str:
 
 
 class KernelCache(NullCache):
-    """Cache of a function's machine code by signature, with the interface of numba's dispatcher."""
+    """Cache of a function's machine code by signature, with the interface of numba's caches."""
 
     def __init__(self, function: Callable[..., Any]):
         self._function = function
@@ -124,7 +124,7 @@ class KernelCache(NullCache):
         return CompileResult._rebuild(target, *pickle.loads(kept))  # type: ignore[no-untyped-call]
 
     def save_overload(self, signature: Any, compiled: Any) -> None:
-        """Store the compiled function of a signature, unless it has addresses of this process."""
+        """Store the compiled function of a signature, unless it holds addresses of this process."""
         if not compiled.library.has_dynamic_globals:
             data = dumps(compiled._reduce())  # type: ignore[no-untyped-call]
             save(self._key(signature, compiled.codegen), data)

@@ -1,8 +1,8 @@
 """Kernel launches on a CUDA GPU: numba compiles the body, the CUDA driver launches it.
 
 The module imports CuPy. A time step of a small lattice launches many short kernels, so the overhead
-of a launch counts. It is lower than numba's, because array descriptors are cached and the driver is
-called directly.
+of a launch counts. It is lower here than in numba, because array descriptors are cached and the
+driver is called directly.
 """
 
 import ctypes
@@ -24,7 +24,8 @@ from msmpetsc.backend.arrays import Array
 from msmpetsc.errors import MsmpetscError
 
 cuda: Any = untyped
-# threads of a block [-]; registers limit kernels that visit all neighbours of a node
+# threads of a block [-]; more would exceed the registers of kernels that visit all
+# neighbours of a node
 THREADS = 128
 # array descriptors in the cache [-]; bounds its memory
 KEPT = 4096
@@ -32,7 +33,7 @@ KEPT = 4096
 SCALARS = {bool: "?7x", int: "q", float: "d"}
 TYPES = {"?7x": numba.types.boolean, "q": numba.types.int64, "d": numba.types.float64}
 
-# words of an argument, as the kernel takes them
+# machine words that pass an argument to a kernel
 Words = tuple[float, ...]
 # kind of an argument: a scalar's format, an array's type as in "f8 2 C", or the class
 # of a NamedTuple and the kinds of its fields
@@ -55,7 +56,7 @@ def launcher(body: Callable[..., None]) -> Callable[..., None]:
 
 
 def as_argument(value: Array | float | tuple[Any, ...]) -> tuple[Kind, Words]:
-    """Return the kind of an argument and its words."""
+    """Return the kind of an argument, and the machine words that pass it to a kernel."""
     if isinstance(value, tuple):
         kinds, words = zip(*map(as_argument, value), strict=True)
         return (type(value), *kinds), tuple(chain.from_iterable(words))

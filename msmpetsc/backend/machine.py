@@ -25,9 +25,9 @@ def machine() -> dict[str, Any]:
 
 
 def return_free_memory() -> None:
-    """Return freed memory to the system, which Open MPI keeps in the process.
+    """Return freed memory to the system.
 
-    Open MPI sets glibc's allocator so that freed memory stays for ever.
+    Open MPI sets glibc's allocator so that freed memory stays in the process.
     """
     if platform.libc_ver()[0] == "glibc":
         ctypes.CDLL(None).malloc_trim(0)
@@ -36,7 +36,8 @@ def return_free_memory() -> None:
 def peak_memory() -> int:
     """Return the peak resident memory of this process [byte].
 
-    On Linux it is VmHWM. getrusage would include the peak of the parent process.
+    On Linux it is VmHWM, because getrusage would include the peak of the parent process. On other
+    systems it is the present memory.
     """
     lines = Path("/proc/self/status").read_text().splitlines() if psutil.LINUX else []
     peaks = [int(line.split()[1]) for line in lines if line.startswith("VmHWM:")]

@@ -32,7 +32,7 @@ class Command:
 
 
 class Shown(argparse.Action):
-    """Action that prints the text returned by its ``const``, a function, and exits."""
+    """Action that calls its ``const``, a function, prints the returned text, and exits."""
 
     def __init__(self, option_strings: list[str], const: Any, help: str, **_: Any):
         super().__init__(option_strings, argparse.SUPPRESS, nargs=0, const=const, help=help)
@@ -62,7 +62,7 @@ def switch(name: str, about: str) -> Argument:
 
 
 def arguments_of_run() -> tuple[Argument, ...]:
-    """Return the arguments of ``run``: the fields of a run request that are not Python's only."""
+    """Return the arguments of ``run``: all fields of a run request that are not for Python only."""
     return tuple(
         argument(
             *option.short,

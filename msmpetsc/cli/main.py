@@ -78,7 +78,7 @@ def carry_out(args: argparse.Namespace, ranks: int) -> int:
     command = COMMANDS[args.command]
     if ranks > 1 and args.command not in ON_RANKS:
         raise InputError(f"{args.command} is for one process: start it without mpiexec")
-    # SIGTERM, like Ctrl-C, then also ends the runs that the command has started
+    # SIGTERM then ends the runs that the command has started, as Ctrl-C does
     if command.starts_runs:
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     module = import_module(f"msmpetsc.cli.commands.{command.module or args.command}")
@@ -112,7 +112,7 @@ def entry_point() -> None:
 def _open_closed_streams() -> None:
     """Open the null device for each standard stream that is closed, as by ``2>&-``.
 
-    Without that a result file would get the descriptor, and lines of C libraries with it.
+    Otherwise a result file would get the descriptor, and C libraries would print into it.
     """
     # in the order of the descriptors, as the lowest free descriptor is opened
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
@@ -137,7 +137,10 @@ def parsed(words: list[str]) -> argparse.Namespace:
 
 
 def split_petsc_options(words: list[str]) -> tuple[list[str], list[str]]:
-    """Return our words, and the PETSc options, which have a single dash and may have a value."""
+    """Return the words of msmpetsc, and the words of PETSc options.
+
+    A PETSc option has a single dash, and may have a value.
+    """
     ours: list[str] = []
     petsc: list[str] = []
     for before, word in pairwise(["", *words]):
@@ -153,7 +156,7 @@ def _is_petsc_option(word: str) -> bool:
 
 
 def _refuse_one_dash(ours: list[str], petsc: list[str]) -> None:
-    """Raise InputError for our options with a single dash, and for unexpected PETSc options."""
+    """Raise InputError for our options with one dash, and for PETSc options outside ``run``."""
     name = ours[0] if ours else ""
     # argparse handles -h and a missing command
     if name not in COMMANDS:

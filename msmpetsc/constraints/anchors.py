@@ -43,7 +43,8 @@ class Anchors:
     ) -> Positions | None:
         """Return q with the anchored nodes at their prescribed positions; None without anchors.
 
-        begin, share : the anchors made this share of their motion from ``begin`` [s] to ``time``
+        begin, share : the pose is this share of the way from the pose at ``begin`` [s] to the
+            pose at ``time``
         """
         anchors = self.acting(time)
         if not anchors:

@@ -1,4 +1,4 @@
-"""External forces on nodes: constant, varying in time, by users' functions, and pressures."""
+"""External forces on nodes: gravity, forces and tractions over time, users' forces, pressures."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -24,7 +24,7 @@ ALWAYS = Lines(np.zeros(1), np.ones((1, 1)))
 
 @dataclass(frozen=True, kw_only=True)
 class Varying(Timed):
-    """A load with a total over time."""
+    """A load whose total is a function of time."""
 
     total: Lines
 
@@ -44,11 +44,11 @@ class Varying(Timed):
 
 @dataclass(frozen=True)
 class Load(Varying):
-    """A force on nodes, a share of a total.
+    """A force on nodes: each node's share times the total.
 
-    share : (owned, 1) share of each node in the total [-]; mass [kg] of gravity, area [m^2] of
-            tractions
-    total : total force [N]; the acceleration [m/s^2] of gravity, a traction [Pa]
+    share : (owned, 1) share of each node in the total [-]; for gravity its mass [kg], for a
+            traction its area [m^2]
+    total : total force [N]; for gravity the acceleration [m/s^2], for a traction [Pa]
     """
 
     share: Rows
@@ -86,7 +86,7 @@ class OwnForce(Varying):
         force = np.zeros((len(q), 3))
         if not len(self.rows):
             return force
-        # A user's function may divide by zero: its result is checked below.
+        # a user's function may divide by zero: the result is checked below
         with np.errstate(all="warn"):
             per_mass = np.asarray(self.function(q[self.rows], v[self.rows], time), float)
         try:
@@ -109,7 +109,7 @@ def shares_by_mass(comm: "MPI.Comm", where: Mask, mass: Floats) -> Rows:
 
 
 class ExternalForces(NamedTuple):
-    """External forces at a time, or their means over a time.
+    """External forces at a time, or their means over an interval of time.
 
     force     : (owned, 3) [N] that do not depend on positions
     pressures : pressures, whose forces follow the surface
@@ -145,8 +145,8 @@ class ActingForces:
     def begin_step(self, q: Positions, v: Rows, time: float) -> None:
         """Evaluate the users' force functions at the state at which a step begins.
 
-        The forces stay constant within the step. So they are explicit, and accurate to first order
-        in the step's length with any integrator.
+        The forces stay constant within the step. So they are explicit, and with any integrator
+        their error is of first order in the time step.
 
         q, v : positions (l, 3) [m] and velocities (l, 3) [m/s]
         time : begin of the step [s]
@@ -162,7 +162,7 @@ class ActingForces:
     def at(self, time: float, users: bool = True) -> ExternalForces:
         """Return the external forces at a time [s].
 
-        users : whether with the users' functions, the part without a potential
+        users : whether to include the users' functions, which have no potential
         """
         return self._with(lambda load: load.state_at(time), users)
 
@@ -171,7 +171,7 @@ class ActingForces:
         return self._with(lambda load: load.mean(begin, end))
 
     def ahead(self, before: float, begin: float, end: float) -> ExternalForces:
-        """Return (3 f - f') / 2 with the means f from begin to end, f' from before to begin [s]."""
+        """Return (3 f - f') / 2: f is the mean from begin to end, f' from before to begin [s]."""
 
         def total(load: Varying) -> Floats:
             mean = load.mean(begin, end)
@@ -180,7 +180,7 @@ class ActingForces:
         return self._with(total)
 
     def _with(self, total: Callable[[Varying], Floats], users: bool = True) -> ExternalForces:
-        """Return the external forces with these totals of each load."""
+        """Return the external forces, with ``total(load)`` as the total of each load."""
         force = np.zeros((self.lattice.owned, 3), like=self.lattice.nodes)
         for load in self.loads:
             force += load.share * like(load.share, total(load))

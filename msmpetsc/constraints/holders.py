@@ -1,18 +1,18 @@
-"""Pins and anchors: their nodes, the springs and cells that a clamp's edge cuts, and reactions.
+"""Pins and anchors: their nodes, springs and cells that the edge of a clamp cuts, and reactions.
 
 A pin's region ends between nodes. A spring from a free to a fixed node deforms only outside the
 region, on the fraction theta of its length. So its stiffness is multiplied by 1 / theta. If the
 fixed node lies outside the body, as at a clamped face, the factor is 1 / (sigma theta). The spring
-then stands for the fraction sigma of its length (cut_cells). Along a row of cells both are exact. A
-clamp oblique to the grid is second-order accurate, like the Poisson equation of Gibou, Fedkiw,
-Cheng and Kang (2002). A solid's cell uses the mean of sigma theta over its pairs of a free and a
-fixed corner. This is too stiff along the clamp, but no strain occurs there.
+then stands for the fraction sigma of its length (cut_cells). Along a row of cells both factors are
+exact. A clamp oblique to the grid is second-order accurate, like the Poisson equation of Gibou,
+Fedkiw, Cheng and Kang (2002). A solid's cell uses the mean of sigma theta over its pairs of a free
+and a fixed corner. This is too stiff along the clamp, but no strain occurs there.
 
-A pin of single components, a roller, ends at its nodes: the rest of their motion is free in its
-region, so that no spring is stiffer.
+A pin of single components, a roller, stiffens no spring: it ends at its nodes, because their other
+components are free.
 
 The reaction on a fixed node is  m a + grad E - f_ext - push.  grad E sums to zero over a body, so
-reactions + loads + pushes = sum of m a.
+the sum of reactions, loads and pushes is the sum of m a.
 """
 
 import math
@@ -33,12 +33,12 @@ from msmpetsc.lattice.lattice import Lattice, MadeSprings
 from msmpetsc.lattice.region import Finder
 from msmpetsc.scene.reading import Scene
 
-# least free fraction of a spring [-]; stiff springs cost iterations and substeps
+# least free fraction theta of a spring [-]; stiff springs cost iterations and substeps
 LEAST = 0.1
 # bisections towards the edge of a region [-]; the edge is exact to 1e-6 of a spring
 HALVINGS = 20
 
-# mask (n,) of the points (n, 3) [m] in a region
+# points (n, 3) [m] -> whether each lies in a region, (n,)
 Within = Callable[[Positions], Mask]
 # local nodes (l,) bool by the table's key in the scene, such as "pin.0"
 Regions = Mapping[str, Mask]
@@ -46,10 +46,10 @@ Regions = Mapping[str, Mask]
 
 @dataclass(frozen=True)
 class Holders:
-    """The pins and then the anchors of a scene, and the pin or anchor that holds each component.
+    """Holders, the pins and then the anchors of a scene, and the holder of each component.
 
-    keys    : keys of their tables in the scene
-    number  : (owned, 3) index in ``keys`` of a component's holder; len(keys) for a free one
+    keys    : keys of the holders' tables in the scene
+    number  : (owned, 3) index in ``keys`` of a component's holder; len(keys) if it is free
     centers : (a, 3) centre of mass of each holder's nodes at rest [m]
     """
 
@@ -59,7 +59,10 @@ class Holders:
 
     @classmethod
     def of_masks(cls, masks: dict[str, Mask], lattice: Lattice) -> "Holders":
-        """Return the holders of components (l, 3); the first holds shared ones (collective)."""
+        """Return the holders from masks (l, 3) of their components (collective).
+
+        A component in several masks belongs to the first.
+        """
         number = np.full((lattice.owned, 3), len(masks), np.int32)
         for holder, where in reversed([*enumerate(masks.values())]):
             number[where[: lattice.owned]] = holder
@@ -90,7 +93,7 @@ class Holders:
 def sums_by(number: Indices, vectors: Rows, count: int) -> Rows:
     """Return the sum (count, k) of vectors (n, k) for each number below count.
 
-    number : (n, 1) number of each vector, or (n, k) of its components, on the same device
+    number : (n, 1) number of each vector, or (n, k) of each component, on the vectors' device
     """
     sums = np.zeros((count, vectors.shape[1]))
     for which in range(count):
@@ -101,7 +104,9 @@ def sums_by(number: Indices, vectors: Rows, count: int) -> Rows:
 def clamped(
     scene: Scene, lattice: Lattice, masks: Regions, finder: Finder, points: Positions
 ) -> Lattice:
-    """Return the lattice with stiffer springs, or cells, where pins and lasting anchors end.
+    """Return the lattice with stiffer springs, or cells, at the edges of pins and lasting anchors.
+
+    A lasting anchor has no ``stop``.
 
     masks  : local nodes (l,) of each table
     points : (l, 3) body points nearest to the nodes [m]
@@ -145,9 +150,10 @@ def clamped(
 def _with_cut_cells(
     lattice: Lattice, is_fixed: Mask, stiffening: Callable[[Indices, Indices], Floats]
 ) -> Lattice:
-    """Return a solid with stiffer cells between free and fixed corners.
+    """Return a solid whose cells with both free and fixed corners are stiffer.
 
-    The factor of a cell is 1 over the mean of sigma theta over its pairs of corners.
+    The factor of a cell is 1 over the mean of sigma theta, over its pairs of a free and a fixed
+    corner.
     """
     assert lattice.solid is not None
     corners = lattice.local_cells
@@ -169,7 +175,7 @@ def _with_cut_cells(
 def _stiffer_springs(
     make_springs: Callable[[], MadeSprings], count: int, corners: Indices, factor: Floats
 ) -> MadeSprings:
-    """Return springs whose L bounds cells that are stiffer by a factor, too (collective).
+    """Return the springs, stiffened so that their L still bounds the stiffened cells (collective).
 
     A spring takes the greatest factor of the cells that contain both its ends.
 
@@ -181,15 +187,15 @@ def _stiffer_springs(
     keys, pair = np.unique(pairs, return_inverse=True)
     most = np.ones(len(keys) + 1)
     np.maximum.at(most, pair.ravel(), np.repeat(factor, 64))
-    # the last entry stands for pairs of other cells
+    # the last entry, 1, is the factor of pairs in other cells
     ends = count * springs.ends[:, 0].astype(np.int64) + springs.ends[:, 1]
     return springs._replace(stiffness=most[places_of(keys, ends)] * springs.stiffness)
 
 
 def _free_fraction(within: Within, start: Positions, end: Positions) -> Floats:
-    """Return the fraction (n,) of each segment, start to end (n, 3), before it enters the region.
+    """Return the fraction (n,) of each segment, from start to end (n, 3), outside the region.
 
-    It is at least LEAST, and 1 if the segment does not enter from outside.
+    It is at least LEAST, and 1 if the segment does not lead from outside into the region.
     """
     enters = within(end) & ~within(start)
     low, high = np.zeros(len(start)), np.ones(len(start))
@@ -203,10 +209,12 @@ def _free_fraction(within: Within, start: Positions, end: Positions) -> Floats:
 def taken(
     comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor], masks: Regions
 ) -> tuple[str, ...]:
-    """Return descriptions of rollers, anchors and forces, and warn of conflicts (collective).
+    """Return how many nodes rollers, anchors and forces have, in words; warn of conflicts.
+
+    Collective.
 
     lattice : the lattice with its pins
-    anchors : the anchors without nodes that a pin or an earlier anchor holds
+    anchors : the anchors without components that a pin or an earlier anchor holds
     masks   : local nodes (l,) in the region of each table
 
     Raises InputError on all ranks if an anchor or a force has no effect.
@@ -235,7 +243,7 @@ def taken(
     for table in scene.tables("force"):
         where, force = masks[table.key], table.table
         until = math.inf if force.stop is None else force.stop
-        # An anchor annuls a force only if it holds the node as long as the force acts.
+        # an anchor cancels a force only if it holds the node as long as the force acts
         lasting = [a.where for a in anchors if a.stop is None or a.stop >= until]
         nodes = count(where)
         fixed = count(where & reduce(np.logical_or, lasting, lattice.fixed).all(axis=1))

@@ -1,4 +1,4 @@
-"""Functions of time: totals of loads, rigid motions, and the times at which a load acts."""
+"""Functions of time: totals of loads, rigid motions, and the interval in which a load acts."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -13,8 +13,8 @@ from msmpetsc.scene.values import Vector
 
 # relative tolerance of times [-]; a multiple of the time step may be rounded down
 SAME_TIME = 1e-12
-# relative distance to an event within which an end of an interval means the event [-];
-# adaptive steps end just before events
+# relative distance within which the end of an interval counts as an event [-]; adaptive
+# steps end just before events
 AT_EVENT = 1e-11
 
 
@@ -39,9 +39,9 @@ class Lines:
         return np.array([np.interp(time, self.times, column) for column in self.vectors.T])
 
     def mean(self, begin: float, end: float, start: float, stop: float | None) -> Floats:
-        """Return the mean (c,) from begin to end [s] of the function, 0 outside start to stop.
+        """Return the mean (c,) from begin to end [s].
 
-        A stop of None is infinite.
+        The function counts as 0 before ``start`` [s] and after ``stop`` [s]; None is infinite.
         """
         kinks = np.array([start, *self.times, np.inf if stop is None else stop])
         for kink in kinks:
@@ -60,7 +60,7 @@ class Lines:
 
 @dataclass(frozen=True)
 class Motion(Lines):
-    """A rigid motion over time: displacements [m] and rotation vectors [rad], side by side (k, 6).
+    """A rigid motion over time: rows (k, 6) of displacement [m] and rotation vector [rad].
 
     The first time is 0, with the zero vector.
 
@@ -71,7 +71,7 @@ class Motion(Lines):
 
     @classmethod
     def through(cls, poses: Iterable[Pose], center: ArrayLike | None = None) -> "Motion":
-        """Return the motion along a scene's path. A path without a center has no rotations."""
+        """Return the motion along a scene's path; ``center`` may be None if nothing rotates."""
         stops = [
             (0.0, np.zeros(6)),
             *((p.time, np.hstack([p.by, np.radians(p.turn)])) for p in poses),
@@ -122,16 +122,16 @@ def total_of(total: Vector | ForceTable | float) -> Lines:
 
 @dataclass(frozen=True, kw_only=True)
 class Timed:
-    """A load that acts while start <= time < stop [s]; a stop of None is infinite."""
+    """A load, anchor or obstacle that acts while start <= time < stop [s]; None is infinite."""
 
     start: float = 0.0
     stop: float | None = None
 
     def acts_at(self, time: float) -> bool:
-        """Return whether the load acts at a time [s]."""
+        """Return whether the load, anchor or obstacle acts at a time [s]."""
         return within(time, self.start, self.stop)
 
     @property
     def events(self) -> list[float]:
-        """Return the times [s] at which the load begins, ends or changes its slope."""
+        """Return the times [s] at which the action begins and ends."""
         return [self.start, *([] if self.stop is None else [self.stop])]

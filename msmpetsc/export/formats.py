@@ -1,8 +1,8 @@
 """Export results: a table of the formats, and the writers of glTF and meshio's formats.
 
-glTF is written here, because libraries for glTF write no animated morph targets. Each frame is a
-morph target of the surface, which Blender and browsers play. The file has a JSON chunk and a binary
-chunk (glTF 2.0 specification, 4.4). In glTF y is up, so the node is rotated.
+glTF is written here, because libraries for glTF write no animated morph targets. Each frame after
+the first is a morph target of the surface, which Blender and browsers play. The file has a JSON
+chunk and a binary chunk (glTF 2.0 specification, 4.4). In glTF y is up, so the node is rotated.
 """
 
 import json
@@ -41,7 +41,7 @@ def normals(points: Array, triangles: Indices) -> Array:
         np.bincount(triangles.ravel(), np.repeat(along, 3), len(points)) for along in of_faces.T
     ]
     vectors = np.stack(sums, axis=1)
-    # no triangle, or folded triangles: any direction will do
+    # a point without triangles, or with folded triangles, may have any normal
     vectors[~vectors.any(axis=1)] = (0, 0, 1)
     return np.divide(vectors, np.linalg.norm(vectors, axis=1, keepdims=True), dtype=np.float32)
 
@@ -99,7 +99,7 @@ def write_glb(run: Result, frames: Sequence[int], path: Path) -> None:
     first, *others = frames
     triangles = run.indices("surface/triangles")
     start = run.surface_at(first)
-    # relative to the body's middle single precision suffices; the node adds the middle
+    # single precision suffices relative to the body's middle, which the node adds
     middle = middle_of(start)
     base = (start - middle).astype(np.float32)
     upright = normals(base, triangles)
@@ -155,7 +155,7 @@ def _document(
 
 
 def _animation(chunk: Chunk, times: Floats, targets: int) -> dict[str, Any]:
-    """Return the animation that blends linearly between the targets at the times (t,) [s]."""
+    """Return the animation that shows each frame at its time (t,) [s], linear between frames."""
     since = (times - times[0]).astype(np.float32)
     weights = np.eye(targets + 1, targets, -1, np.float32).ravel()
     sampler = {
@@ -168,7 +168,7 @@ def _animation(chunk: Chunk, times: Floats, targets: int) -> dict[str, Any]:
 
 
 def write_usd(run: Result, frames: Sequence[int], path: Path) -> None:
-    """Write frames as USD by a library that only this format needs."""
+    """Write frames as USD, by a library that no other format needs."""
     from msmpetsc.export import usd
 
     usd.write_usd(run, frames, path)

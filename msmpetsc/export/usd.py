@@ -1,4 +1,4 @@
-"""Write USD by its own library: a mesh for each body, with a time sample of its points a frame.
+"""Write USD by its own library: a mesh for each body, with a time sample for each frame.
 
 .usda is text, .usdc and .usd are binary. Normals are stored too, because without them programs
 shade each triangle flat.
@@ -24,8 +24,8 @@ SAVED = 16
 
 
 def write_usd(run: Result, frames: Sequence[int], path: Path) -> None:
-    """Write frames as USD. Raises OSError if the library cannot."""
-    # raises a plain error if the file cannot be written; the library's has many lines
+    """Write frames as USD. Raises OSError if the library cannot write them."""
+    # gives a plain error if the file cannot be written; the library's has many lines
     path.touch()
     try:
         stage = Usd.Stage.CreateNew(str(path))
@@ -90,13 +90,13 @@ class UsdBody:
 
 
 def up_axis(scene: dict[str, Any]) -> str:
-    """Return the upward axis: against gravity if USD supports that axis, else z."""
+    """Return the upward axis, y or z: the axis of gravity, or z if gravity is absent or along x."""
     acceleration = np.array(scene.get("gravity", {}).get("acceleration", (0, 0, 0)), float)
     return str(UP.get(int(np.argmax(abs(acceleration))), UsdGeom.Tokens.z))
 
 
 def frames_a_second(times: Floats) -> float:
-    """Return frames per second at times (t,) [s]; equally spaced frames are a time code apart."""
+    """Return the frames per second of frames at times (t,) [s], by the median of their spacing."""
     spacing = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     return float(f"{1 / spacing:.9g}")
 

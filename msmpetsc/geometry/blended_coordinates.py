@@ -15,10 +15,10 @@ If the corners in B_c have no weight, b = 1 and s = x, so the normalisation neve
 
 Affine maps
 -----------
-These are Eq. 8 alone, over all 8 corners, with L_v(p) = x_v + F_v (p - v). The gradient F_v fits
-x_j - x_v = F_v (X_j - X_v) by least squares over the nodes j of the valid cells around v. It
-depends only on which of these 8 cells are valid, so all cells at v use the same L_v. Hence position
-and slope are continuous across every shared face (see ``block.corner_blend``).
+The blended affine maps are Eq. 8 alone, over all 8 corners, with L_v(p) = x_v + F_v (p - v). The
+gradient F_v fits x_j - x_v = F_v (X_j - X_v) by least squares over the nodes j of the valid cells
+around v. F_v depends only on which of these 8 cells are valid, so all cells at v use the same L_v.
+Hence position and slope are continuous across every shared face (see ``block.corner_blend``).
 """
 
 from functools import cache
@@ -41,9 +41,9 @@ from msmpetsc.geometry.mean_value_coordinates import PointView, joined_cage, set
 
 @njit()
 def own_weight(own: Floats, valid: Mask, smoothing: float) -> float:
-    """Return b(p) of Eq. 9, f_h = smoothstep(x / h): 0 on the parts shared with valid neighbours.
+    """Return b(p) of Eq. 9 with f_h = smoothstep(x / h): 0 where a valid neighbour shares p.
 
-    own : (64,) coordinates in the cell alone; Eq. 9 sums them over the corners that a neighbour has
+    own : (64,) coordinates in the cell alone; Eq. 9 sums them over a neighbour's corners
     """
     product = 1.0
     for cell in range(27):
@@ -58,7 +58,10 @@ def own_weight(own: Floats, valid: Mask, smoothing: float) -> float:
 
 @njit()
 def boundary_blends(u: Floats, valid: Mask, blends: Floats) -> float:
-    """Set W(v, p) of Eq. 8 in blends (8,), 0 at corners of no other cell; return their sum."""
+    """Set W(v, p) of Eq. 8 in ``blends`` (8,), 0 at corners that no other cell has.
+
+    Return the sum of the blends.
+    """
     for v in range(8):
         mask = cells_around(v, valid)
         alone = mask & (mask - 1) == 0
@@ -69,6 +72,8 @@ def boundary_blends(u: Floats, valid: Mask, blends: Floats) -> float:
 @njit()
 def cages_weights(u: Rows, neighbours: Mask, smoothing: float, weights: Rows) -> None:
     """Set s(p) of Eq. 7 in ``weights``.
+
+    The arguments are as in ``embedding.stencil_weights``.
 
     u          : (p,3) in [0,1]
     neighbours : (p,27) bool
@@ -101,8 +106,8 @@ def cages_weights(u: Rows, neighbours: Mask, smoothing: float, weights: Rows) ->
 def gradient_table() -> Rows:
     """Return a table (256,3,27) of gradients: column a of F_v is table[mask, a] @ x.
 
-    The mask is the result of ``cells_around``, and x are the 3x3x3 nodes around v. A single valid
-    cell suffices, as its 8 nodes span space. Mask 0 does not occur and holds zeros.
+    ``mask`` is the result of ``cells_around``, and x (27,3) are the 3x3x3 nodes around v. A single
+    valid cell suffices, because its 8 nodes span space. Mask 0 does not occur; its rows are zero.
     """
     axes = [[-1.0, 0.0, 1.0]] * 3
     offsets = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(27, 3)
@@ -118,7 +123,7 @@ def gradient_table() -> Rows:
     # normal equations: their solution is exactly 0 at nodes of no valid cell
     normal = spans[1:].swapaxes(1, 2)
     table[1:] = np.linalg.solve(normal @ spans[1:], normal)
-    # x_j - x_v gives the negative sum at v itself
+    # v itself has the negative sum, because the fit is to x_j - x_v
     table[:, :, 13] = -table.sum(2)
     return table
 

@@ -19,7 +19,7 @@ from msmpetsc.backend.kernel import njit
 MIDDLE = 13
 CELL_STRIDE = np.array([9, 3, 1])
 NODE_STRIDE = np.array([16, 4, 1])
-# entry for every cell outside the block
+# common entry of all cells outside the block
 OUTSIDE = 27
 
 

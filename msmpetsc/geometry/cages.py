@@ -1,8 +1,8 @@
 """Fill the bodies' surfaces with uniform grid cells, the cages (paper section 4.1).
 
-A cell is external, boundary or interior. Boundary and interior cells are valid and are kept.
-Rank 0 holds the surfaces. Each rank finds the valid cells in its slab of each grid, and then
-the cells are distributed over the ranks in Morton order.
+A cell is external, boundary or interior. Boundary and interior cells are valid: they form the
+lattice. Rank 0 holds the surfaces. Each rank finds the valid cells in its slab of each grid. Then
+the ranks exchange cells, so that each has a range of the Morton order.
 """
 
 from collections.abc import Sequence
@@ -30,22 +30,23 @@ from msmpetsc.geometry.valid_cells import (
 )
 
 BOUNDARY, INTERIOR = 1, 2
-# least fill of a corner [-]; keeps a corner far from the inside from having no mass
+# least fill of a corner [-]; gives a corner far from the inside some mass
 LEAST_FILL = 1e-3
-# fill above which a corner counts as full [-]; the difference from 1 is rounding
+# fill from which a corner counts as full [-]; the difference from 1 is rounding
 FULL = 1 - 1e-9
-# relative error of a cell count [-]; far below the lattice's own error
+# accepted relative error of a cell count [-]; far below the lattice's own error
 TOLERANCE = 0.01
-# relative error of a body's mass that is told [-]; far above rounding
+# relative error of a body's mass from which a warning is logged [-]; far above rounding
 MASS_TOLERANCE = 0.02
 
 
 @dataclass(frozen=True)
 class BodySurface:
-    """A surface on rank 0, with its measures on all ranks.
+    """A body's surface on rank 0, and its measures on all ranks.
 
+    surface   : None on other ranks
     bounds    : (2, 3) bounding box [m]
-    thickness : of a closed body; None if it was not measured
+    thickness : thickness of a closed body; None if it was not measured
     """
 
     comm: MPI.Comm
@@ -65,9 +66,9 @@ class Cages:
                   (geometry.fill_fractions)
     moments     : (n_local, 3) second moments of the material about the cells' middles [cells^5]
     is_weighted : whether boundary cells are weighted by their fill
-    copies      : cells with corners of their own; None if all cells are ordinary
+    copies      : cells whose corners are not the ordinary nodes; None if all cells are ordinary
     parts       : finder of the part of a cell that holds a point, for each body on rank 0; None
-                  elsewhere, and for a body without parts
+                  on other ranks, and for a body without parts
     """
 
     grids: BodyGrids
@@ -97,10 +98,10 @@ class Cages:
 
 @dataclass(frozen=True)
 class SlabCells:
-    """Valid cells in a rank's slab of the grid, whose axes are cycled to put the longest first.
+    """Valid cells in a rank's slab of a grid. The axes are cycled, so that the longest is first.
 
     boundary : (b, 3) cells that the surface touches
-    gaps     : (g, 4) interior cells (geometry.valid_cells)
+    gaps     : (g, 4) interior cells as gaps (geometry.valid_cells)
     columns  : fill of the boundary cells; None if the surface is open or wound inconsistently
     """
 
@@ -151,7 +152,7 @@ def fill(
 
 
 def _log_copies(copies: Copies | None) -> None:
-    """Log how many copies of cells and nodes there are."""
+    """Log the number of copies of cells and of nodes, if any."""
     if copies:
         cells = int((copies.keys % COPIES > 0).sum())
         nodes = np.unique(copies.corners)
@@ -164,7 +165,7 @@ def _log_copies(copies: Copies | None) -> None:
 def _parts_of_all(
     bodies: Sequence[BodySurface], grids: BodyGrids, slabs: Sequence[SlabCells]
 ) -> list[CellParts | None]:
-    """Return the parts of each closed and weighted body on rank 0, None elsewhere (collective)."""
+    """Return the parts of each closed body on rank 0; None on other ranks (collective)."""
 
     def of_root() -> list[CellParts | None]:
         return [
@@ -184,7 +185,9 @@ def _with_copies(
     keys: Indices,
     columns: list[Array],
 ) -> tuple[Indices, list[Array]]:
-    """Return cells with copies for the parts in them; each part has its share (collective).
+    """Return the keys and columns of the cells, with a copy for each part in a cell (collective).
+
+    A copy has the share of its part in fills and second moments.
 
     keys    : (n,) keys of this rank's cells
     columns : kind (n,), fills (n, 2, 2, 2) and second moments (n, 3)
@@ -237,7 +240,7 @@ def _cells_of(
 
 
 def _clipped(fills: Rows, moments: Rows) -> tuple[Rows, Rows]:
-    """Return fills from LEAST_FILL to 1, and second moments changed by the mass that this adds."""
+    """Return fills clipped to LEAST_FILL and 1, and second moments with the mass thus added."""
     clipped = np.clip(np.where(fills > FULL, 1.0, fills), LEAST_FILL, 1.0)
     return clipped, moments + (clipped - fills).mean(axis=(1, 2, 3))[:, None] / 4
 
@@ -245,9 +248,11 @@ def _clipped(fills: Rows, moments: Rows) -> tuple[Rows, Rows]:
 def _warn_of_masses(
     bodies: Sequence[BodySurface], fills: Sequence[Rows], cell_size: float, is_weighted: bool
 ) -> None:
-    """Warn of the body whose mass differs most from its mesh, a sum of signed parts (collective).
+    """Warn of the body whose cells and mesh differ most in volume (collective).
 
-    fills : of this rank's cells of each body
+    The volume of a mesh is a sum of signed parts.
+
+    fills : for each body, the fills of this rank's cells
     """
     filled = bodies[0].comm.allreduce(np.array([rows.sum() / 8 for rows in fills])) * cell_size**3
     enclosed = np.array([abs(body.report.volume) for body in bodies])
@@ -312,7 +317,7 @@ def _slab_cells(body: BodySurface, grid: Grid) -> SlabCells:
 
 
 def _axes(body: BodySurface) -> Indices:
-    """Return the axes (3,) of the grid, cycled so that the body's longest axis is first."""
+    """Return the axes (3,) of the grid, cycled so that the body's longest side is first."""
     return np.roll([0, 1, 2], -int(np.argmax(body.bounds[1] - body.bounds[0])))
 
 
@@ -348,7 +353,7 @@ def _gaps_by_winding(
 ) -> Indices:
     """Return the interior cells (g, 4) of a slab, by the winding numbers of their centres.
 
-    The time grows with the bounding box, the memory does not. Every rank needs the whole surface
+    The time grows with the bounding box; the memory does not. Every rank gets the whole surface
     (collective). Source: Jacobson et al. 2013.
     """
     surface = body.comm.bcast(body.surface)

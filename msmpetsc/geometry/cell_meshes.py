@@ -1,4 +1,4 @@
-"""Read meshes of cells by meshio: their boundary, and their named sets of cells and points."""
+"""Read meshes of cells by meshio: boundary triangles, and named sets of cells and points."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from io import StringIO
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 # triangles (f, 3) by the name of their group
 Groups = dict[str, Indices]
 
-# labels of an array [-]; an array with more labels numbers cells and names no groups
+# most labels of an array of groups [-]; an array with more labels numbers the cells
 MOST_LABELS = 1000
-# lines asked for past the end of a text [-]; readers of intact files ask for few
+# most lines asked for past the end of a text [-]; readers of intact files ask for few
 MOST_LINES_PAST_END = 100
 
 
@@ -26,7 +26,7 @@ class Kind(NamedTuple):
 
     faces     : corners of each face, in order around it
     edges     : corners of each edge, in the order of the mid-edge nodes
-    quadratic : node counts of the cells with mid-edge nodes; meshio has no such wedge
+    quadratic : node counts of cells whose mid-edge nodes are used; none for pyramids and wedges
     """
 
     dimension: int
@@ -61,7 +61,7 @@ KINDS = {
         (20, 27),
     ),
 }
-# triangles of a face by its number of nodes; of 6 or 8 nodes every second is mid-edge
+# triangles of a face by its number of nodes; with 6 or 8 nodes every second is mid-edge
 CUTS = {
     3: [[0, 1, 2]],
     4: [[0, 1, 2], [2, 3, 0]],
@@ -110,7 +110,7 @@ def read_cells(path: Path, data: bytes) -> tuple[Positions, Indices, Groups]:
 class _Lines(StringIO):
     """A text that raises EOFError if a reader asks for many lines past its end.
 
-    meshio's readers of damaged texts would otherwise not return.
+    Without it, meshio's readers would not return from some damaged texts.
     """
 
     lines_past_end = 0
@@ -124,7 +124,7 @@ class _Lines(StringIO):
 
 
 def _kind(name: str) -> Kind | None:
-    """Return the kind of cell of meshio's name, "tetra10"; None for vertices and lines.
+    """Return the kind of cell by meshio's name, such as "tetra10"; None for vertices and lines.
 
     Raises ValueError for any other cell.
     """
@@ -151,7 +151,7 @@ def _sets(mesh: "meshio.Mesh", blocks: MeshBlocks) -> Iterator[tuple[str, list[I
     for key, label, default_name in labels_of(
         {key: each for key, each in arrays.items() if each.shape == dimensions.shape}
     ):
-        # gmsh names a pair of label and dimension, and label 0 means no group
+        # gmsh gives a name to a pair of label and dimension; label 0 means no group
         is_gmsh = key == "gmsh:physical"
         names = (
             {(int(tag), int(size)): name for name, (tag, size) in mesh.field_data.items()}
@@ -188,7 +188,7 @@ def _shell_triangles(blocks: MeshBlocks) -> Indices:
 def boundary(points: Positions, blocks: MeshBlocks) -> Indices:
     """Return the faces that belong to a single cell as triangles (f, 3), wound outwards.
 
-    Faces of an inverted cell are turned.
+    Faces of an inverted cell are reversed.
     """
     solid = [
         (kind, cells, _volumes(points, kind, cells) < 0)

@@ -2,16 +2,17 @@
 
 A slit narrower than a cell leaves several parts of the body in a cell. They are found in 3 steps:
 
-1. The triangles in a cell that are joined by mesh edges within the cell are a piece of surface.
-   The body along the inner side of a piece is connected. So a cell has at most as many parts as
-   pieces. Triangles that end in a low face of the cell bound the body below: a separate piece.
+1. Triangles in a cell that mesh edges join within the cell form a piece of surface. The body along
+   the inner side of a piece is connected. So a cell has at most as many parts as pieces. Triangles
+   that end in a low face of the cell bound the body in the cell below: they are a separate piece.
 2. In a cell of several pieces, LINES x LINES lines run along each axis, and their crossings form a
    grid of points. Neighbouring points, and points and pieces, are joined if the line between them
-   is inside the body. Pieces that are joined bound the same part.
-   A piece between the lines is joined with the piece that a ray inwards from it meets. If it meets
-   none, the piece is joined with a point that the middle of the ray sees.
-3. Parts of two cells meet in a common face if a piece crosses it. They also meet if a line of
-   step 2 crosses it inside both parts. For two cells of a single part, a point of it decides.
+   is inside the body. Joined pieces bound the same part.
+   If no line meets a piece, a ray runs inwards from it. The piece is joined with the first piece
+   that the ray meets. If there is none, it is joined with a point seen from the ray's middle.
+3. Parts of two cells meet in the common face if a piece crosses the face. They also meet if a line
+   of step 2 crosses the face inside both parts. For two cells of a single part, the middle of an
+   uncrossed face decides.
 
 Steps 1 and 3 are exact. Step 2 may separate a part at a neck that is thinner than the distance of
 the lines (geometry.lines_in_cells).
@@ -36,7 +37,8 @@ from msmpetsc.geometry.parts_of_points import PartsOfPoints
 from msmpetsc.geometry.surface import Surface, first_of_equal, is_inside
 from msmpetsc.geometry.valid_cells import touched_cells
 
-# distance of a face's low side from the face [cells]; above rounding, below any wall
+# distance from a face of the point that stands for it, on its low side [cells]; above
+# rounding, below the thickness of any wall
 BESIDE = 1e-4
 
 
@@ -63,10 +65,11 @@ class CellParts:
     links     : parts of neighbouring cut cells that meet
     faces     : (b, 6) parts at the faces of each cell as bit masks, the low faces first; 1 in a
                 cell of a single part
-    separated : (b,) whether a common face with another cut cell lies outside the body
-    shares    : (s, 2, 2, 2) shares of the fill at corners, for each part of cells of several parts
-    spread    : (s, 3) shares of the second moments, for the same parts
-    points    : parts of points on the surface
+    separated : (b,) whether no parts meet in one of the faces shared with another cut cell
+    shares    : (s, 2, 2, 2) share of each part in the fills of its cell's corners, for the parts of
+                cells with several parts
+    spread    : (s, 3) share of the same parts in their cells' second moments
+    points    : finder of the part that holds a point
     """
 
     keys: Indices
@@ -134,7 +137,7 @@ def parts_of(surface: Surface, grid: Grid, axes: Indices, volume: float) -> Cell
 def _rows_in_cells(
     surface: Surface, grid: Grid, axes: Indices, volume: float
 ) -> tuple[Indices, Indices, Array, Indices, Rows]:
-    """Return the rows of a cell and a triangle that touch; arguments are those of ``parts_of``.
+    """Return the rows, pairs of a cell and a triangle that touch, for arguments of ``parts_of``.
 
     The result is
 
@@ -169,7 +172,10 @@ def _rows_in_cells(
 def _edges_in_cells(
     surface: Surface, at: Rows, touched: Callable[[Rows], tuple[Indices, Indices]]
 ) -> tuple[Indices, Indices, Indices]:
-    """Return the cells (e,) that mesh edges touch, and two triangles (e,), (e,) at the edge."""
+    """Return pairs (e,) of a cell and a mesh edge that touch: the cell, and the edge's triangles.
+
+    The cells are packed in the axes of ``touched``; the two triangles are (e,) each.
+    """
     merged = first_of_equal(surface.points)
     corner = merged[surface.triangles]
     start, end = corner.ravel(), np.roll(corner, -1, axis=1).ravel()
@@ -184,10 +190,10 @@ def _edges_in_cells(
 
 
 def _flush(corners: Rows, triangle: Indices, keys: Indices, cell: Indices) -> Array:
-    """Return the axes along which rows' triangles end in the low face of their cells, as bits (r,).
+    """Return the axes, as bits (r,), along which a row's triangle ends in its cell's low face.
 
-    The body at such a triangle lies below the face, unless the triangle lies in the face and the
-    body above it.
+    The body at such a triangle lies below the face. A triangle in the face with the body above has
+    no bit.
     """
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     top = corners.max(axis=1)
@@ -202,7 +208,7 @@ def _flush(corners: Rows, triangle: Indices, keys: Indices, cell: Indices) -> Ar
 def _ends_of_edges(
     codes: Indices, size: int, number: Indices, one: Indices, other: Indices
 ) -> Indices:
-    """Return the two triangles' rows (2, e) of a cell that mesh edges in the cell join.
+    """Return the pairs of rows (2, e) that a mesh edge joins in a cell.
 
     number     : (e,) number of the cell, -1 if there is none
     one, other : (e,) triangles at the edge
@@ -212,7 +218,7 @@ def _ends_of_edges(
 
 
 def _pieces(cell: Indices, cells: int, joined: Indices) -> tuple[Indices, Indices]:
-    """Return the piece (r,) of each row of a cell, and the number (cells,) of pieces of a cell.
+    """Return the piece (r,) of each row, and the number of pieces (cells,) of each cell.
 
     cell   : (r,) cell of each row
     joined : (2, e) joined rows
@@ -229,10 +235,11 @@ def _pieces(cell: Indices, cells: int, joined: Indices) -> tuple[Indices, Indice
 def _crossing_rows(
     codes: Indices, keys: Indices, size: int, flush: Array, ends: Indices
 ) -> list[Indices]:
-    """Return for each axis the rows (2, n) of two neighbouring cells whose surface crosses a face.
+    """Return, for each axis, pairs of rows (2, n) whose surface crosses the face of two cells.
 
-    Either a triangle is in both cells, or two triangles meet in a mesh edge in the face. Then one
-    triangle ends in the face, and its row in the upper cell is flush.
+    The rows belong to the lower and the upper cell. Either they have the same triangle, or their
+    triangles share a mesh edge in the face. In that case a triangle ends in the face, and its row
+    in the upper cell is flush.
     """
     ijk, cell, triangle = unpacked(keys), codes // size, codes % size
     crossing = []
@@ -279,14 +286,14 @@ def _links(
     """Return the parts of neighbouring cut cells that meet, and the mask (b,) of ``separated``.
 
     cell     : (r,) cell of each row
-    part     : (r,) part of each row, -1 for a piece that bounds no part of the cell
+    part     : (r,) part of each row, -1 if its piece bounds no part of the cell
     crossing : for each axis, the rows of ``_crossing_rows``
     """
     ijk, masks, steps = unpacked(keys), sides.masks(), np.eye(3, dtype=np.int64)
     beyond = np.stack([places_of(keys, packed(ijk + step)) for step in steps])
     # rows of pieces that bound parts
     bounding = [rows[:, (part[rows] >= 0).all(axis=0)] for rows in crossing]
-    # a point of an uncrossed face tells whether two cells of a single part meet
+    # the middle of an uncrossed face tells whether two cells of a single part meet
     is_single = sides.row[:, 0] < 0
     asked = (beyond >= 0) & is_single & is_single[beyond]
     for axis, (below, _) in enumerate(bounding):
@@ -300,7 +307,7 @@ def _links(
         meeting = [np.stack([cell[below], part[below], part[above]])]
         low = np.flatnonzero(beyond[axis] >= 0)
         high = beyond[axis, low]
-        # lines of cells with several parts tell which parts are inside at the face
+        # in cells with several parts, lines tell which parts meet in the face
         rows = sides.row[low, 3 + axis], sides.row[high, axis]
         both = (rows[0] >= 0) & (rows[1] >= 0)
         neither = is_single[low] & is_single[high]
@@ -326,8 +333,8 @@ class Split(NamedTuple):
     part   : (k,) part of each piece, cell after cell; -1 for a piece that bounds no part
     parts  : (c,) number of parts in each cell
     faces  : (m, 6, LINES^2) part at each line of each face of the m cells with several parts
-    shares : (s, 2, 2, 2) share of each part of several of the fill of the corners
-    spread : (s, 3) share of each part of several of the second moments
+    shares : (s, 2, 2, 2) share of each of their parts in the fills of the cell's corners
+    spread : (s, 3) share of each of their parts in the cell's second moments
     """
 
     part: Indices

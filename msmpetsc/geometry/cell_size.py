@@ -1,4 +1,4 @@
-"""Search of the cell size that gives a wanted number of cells."""
+"""Find the cell size for a wanted number of cells, and warn of walls too thin for the cells."""
 
 from collections.abc import Sequence
 
@@ -11,7 +11,7 @@ from msmpetsc.geometry.grid import BodyGrids
 from msmpetsc.geometry.thickness import ADVISED, ENOUGH
 from msmpetsc.scene.body import SOLID
 
-# cell sizes tried [-]; real models need 3 to 6
+# most cell sizes tried [-]; real models need 3 to 6
 SEARCH_LIMIT = 30
 
 
@@ -20,9 +20,9 @@ def choose_cell_size(
 ) -> float:
     """Return the cell size [m] that gives ``count`` cells within 1% (collective).
 
-    The number of cells is about a power of the size, so a secant search runs in logarithms. A
-    bracket guards it, because the number is a step function and not quite monotone. If no size
-    meets the tolerance, the nearest is returned with a warning.
+    The number of cells is about a power of the size, so the search is a secant method in
+    logarithms. A bracket guards it, because the number is a step function and not quite monotone.
+    If no size meets the tolerance, return the best size and log a warning.
 
     Raises InputError if ``count`` is more than ``max_cells``.
     """
@@ -69,9 +69,9 @@ def estimated_size(bodies: Sequence[BodySurface], count: float) -> float:
 
 
 def advised_size(bodies: Sequence[BodySurface], law: str) -> float:
-    """Return the cell size [m] on which the thin tenth of each body bends enough.
+    """Return the largest cell size [m] at which the thinnest tenth of each body bends enough.
 
-    It is infinity if all bodies are open.
+    Return infinity if all bodies are open.
     """
     sizes = [body.thickness.advised_size(law) for body in bodies if body.thickness]
     return min(sizes, default=np.inf)
@@ -80,7 +80,7 @@ def advised_size(bodies: Sequence[BodySurface], law: str) -> float:
 def warn_of_thin_bodies(bodies: Sequence[BodySurface], cell_size: float, law: str) -> None:
     """Warn if a tenth of a body is so thin that it bends too little on cells of side h [m].
 
-    law : law of the material, which decides whether walls along the grid count
+    law : law of the material; in a solid, walls along the grid bend freely
     """
     bending = {
         number: body.thickness.bending(cell_size, law)
@@ -102,7 +102,7 @@ def warn_of_thin_bodies(bodies: Sequence[BodySurface], cell_size: float, law: st
 
 def _next_guess(excess: dict[float, float], nearest: float) -> float:
     """Return the root of the secant through the two best sizes, or else the bracket's middle."""
-    # first slope: between -2 of a shell and -3 of a solid
+    # slope of the first step: between -2 for a shell and -3 for a solid
     slope = -2.5
     if len(excess) > 1:
         second = min(

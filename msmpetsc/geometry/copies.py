@@ -1,10 +1,10 @@
-"""Copies of cells and nodes, where the body is in several parts (Molino, Bao and Fedkiw 2004).
+"""Copies of cells that contain several parts of the body (Molino, Bao and Fedkiw 2004).
 
 A cell has a copy for each part of the body in it (geometry.cell_parts). Two copies of cells at a
-grid node share a copy of the node if their parts meet across faces at the node. Further cells at
-the node may lie between them. So the two sides of a narrow slit move apart.
+grid node share a copy of the node if their parts meet in faces at the node. The parts may also meet
+through further cells at the node. So the two sides of a narrow slit move apart.
 
-Copy 0 of a cell with copies 0 of its corners is the ordinary cell. ``Copies`` lists the others.
+Copy 0 of a cell, with copy 0 of each corner, is the ordinary cell. ``Copies`` lists the rest.
 """
 
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ FACES = [
 
 @dataclass(frozen=True)
 class Copies:
-    """Cells whose corners are not all copies 0, or that are not copy 0 themselves; on all ranks.
+    """Table, on all ranks, of the cells that are not ordinary: the cell or a corner is no copy 0.
 
     keys    : (e,) keys of the cells, ascending
     corners : (e, 8) keys of their corner nodes
@@ -58,9 +58,9 @@ class Copies:
         return corners
 
     def parts_at_nodes(self, table: SortedKeys, keys: Indices) -> Indices:
-        """Return the part (n, 8) of which nodes (n,) are a corner in the cells around (collective).
+        """Return the part (n, 8) of each cell around nodes (n,) that has the node (collective).
 
-        It is -1 where no part of the cell has the node.
+        The part is -1 if no part of the cell has the node as a corner.
 
         table : keys of all valid cells
         """
@@ -85,7 +85,7 @@ NO_COPIES = Copies(np.empty(0, np.int64), np.empty((0, 8), np.int64))
 def find_copies(
     bodies: Sequence[CellParts | None], grids: BodyGrids, table: SortedKeys
 ) -> Copies | None:
-    """Return the copies of the cells of several bodies, None if there are none (collective).
+    """Return the cells of all bodies that are not ordinary; None if there are none (collective).
 
     bodies : parts of each body's cells on rank 0; None on other ranks, and for a body without parts
     table  : keys of all valid cells
@@ -128,8 +128,8 @@ def _copies_of_body(
 def _suspects(parts: CellParts) -> Indices:
     """Return the nodes (n, 3) that may have copies.
 
-    They are the corners of cells with several parts, and of cells separated from a neighbour. If
-    the cut cells at a node are not all connected by faces, the node may have copies, too.
+    They are corners of cells with several parts or separated from a neighbour, or nodes whose cut
+    cells are not all connected by faces.
     """
     steps = packed(CORNERS)
     nodes = np.unique(parts.keys[:, None] + steps)
@@ -146,17 +146,17 @@ def _suspects(parts: CellParts) -> Indices:
 
 @cache
 def _disconnected() -> Mask:
-    """Return for each mask (256,) of octants whether the octants are not all joined by faces."""
+    """Return, for each mask (256,) of octants, whether its octants are not all joined by faces."""
     bits = np.zeros((256, 2, 2, 2), np.int64)
     bits[:, *CORNERS.T] = np.arange(256)[:, None] >> np.arange(8) & 1
     return np.array([label(octants)[1] > 1 for octants in bits])
 
 
 def _node_copies(parts: CellParts, cells: Indices, is_valid: Mask, around: Indices) -> Indices:
-    """Return the copy (n, 8, COPIES) of each node that the parts of the cells around it share.
+    """Return which copy of a node each part of the cells around it has, (n, 8, COPIES).
 
-    It is -1 where there is no such part. A node has at most COPIES copies; the last is shared by
-    all further parts.
+    The copy is -1 if there is no such part. A node has at most COPIES copies; all further parts
+    share the last.
 
     cells    : (c, 3) grid indices
     is_valid : (c,) bool
@@ -172,7 +172,7 @@ def _node_copies(parts: CellParts, cells: Indices, is_valid: Mask, around: Indic
     ends = []
     for axis, low, high in FACES:
         below, above = number[around[:, low]], number[around[:, high]]
-        # bits p COPIES + q of parts p and q that meet; an uncut cell has whole faces
+        # bit p COPIES + q is set if parts p and q meet; an uncut cell has whole faces
         pairs = np.where(below < 0, _spread(parts.faces[above, axis], 1), meets[below, axis])
         pairs = np.where(above < 0, _spread(parts.faces[below, 3 + axis], COPIES), pairs)
         pairs = np.where((below < 0) & (above < 0), 1, pairs)

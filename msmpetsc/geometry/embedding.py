@@ -24,7 +24,7 @@ from msmpetsc.geometry.partition import SortedKeys
 
 # largest distance of a point outside its cell [cells]; above rounding
 ROUNDING = 1e-9
-# distance from a face of its cell at which a point is moved onto it [cells]; rounding
+# distance within which a point is moved onto a face of its cell [cells]; rounding
 ON_FACE = 1e-14
 # points in a batch [-]; bounds their weights to 16 MB
 CHUNK = 1 << 15
@@ -40,8 +40,8 @@ def embed(
 
     Each rank has a contiguous range of the rows. The columns are global node numbers.
 
-    points : for each body (v, 3) [m] on rank 0, (0, 3) on other ranks; all in its valid cells
-    nodes  : node numbers of the lattice by grid key
+    points : for each body (v, 3) [m] on rank 0, (0, 3) on other ranks; all in valid cells
+    nodes  : keys of the lattice's nodes, whose positions are the node numbers
     kind, smoothing : see ``stencil_weights``
 
     Raises ValueError on all ranks if a point lies in no valid cell.
@@ -74,9 +74,9 @@ def embed(
 
 
 def _to_cells(points: Sequence[Positions], cages: Cages) -> tuple[Indices, Indices, Rows]:
-    """Send points to the ranks of their cells (collective).
+    """Send points to the ranks that own their cells (collective).
 
-    Return the number (p,), the key of the cell (p,) and the coordinates in it (p, 3) of each.
+    Return, for the points received, number (p,), key of the cell (p,) and coordinates in it (p, 3).
     """
     of_bodies = [cells_at(cages, body, of_body) for body, of_body in enumerate(points)]
     keys, u = (np.concatenate(rows) for rows in zip(*of_bodies, strict=True))
@@ -85,10 +85,10 @@ def _to_cells(points: Sequence[Positions], cages: Cages) -> tuple[Indices, Indic
 
 
 def cells_at(cages: Cages, body: int, points: Positions) -> tuple[Indices, Rows]:
-    """Return the keys (n,) of cells that hold points (n, 3) [m], and coordinates in them (n, 3).
+    """Return the key (n,) of the cell of each point (n, 3) [m], and coordinates in it (n, 3).
 
-    A cell with several parts has a copy for the part of each point. The points are of a body's
-    surface or inside it, on rank 0.
+    In a cell with several parts, the key names the copy for the part that holds the point. Only
+    rank 0 finds this copy. The points lie on a body's surface or inside it.
     """
     at, parts = cages.grids.grids[body].to_cells(points), cages.parts[body]
     ijk = np.floor(at).astype(np.int64)
@@ -99,8 +99,8 @@ def cells_at(cages: Cages, body: int, points: Positions) -> tuple[Indices, Rows]
 def _around(cages: Cages, keys: Indices) -> tuple[Mask, Indices]:
     """Return the valid cells (c, 27) and the node keys (c, 64) around cells (c,) (collective).
 
-    A neighbour counts if a single copy of it shares a corner with the cell. The key of a node of no
-    such cell belongs to no node, or to a node that has no weight.
+    A neighbour counts as valid if exactly one copy of it shares a corner with the cell. A node that
+    belongs to no such cell has a key of no node, or of a node without weight.
     """
     around = decode_morton(keys)[:, None, :]
     cells = encode_morton(around + CELLS_AROUND)
@@ -116,7 +116,7 @@ def _around(cages: Cages, keys: Indices) -> tuple[Mask, Indices]:
     joined &= cages.table.find(copies) >= 0
     joined[:, MIDDLE] = copies[:, MIDDLE] == keys[rows, None]
     neighbours[rows] = joined.sum(axis=2) == 1
-    # the cell itself comes last, so that its corners are its own
+    # the cell itself comes last, so that its own corners count
     for cell in np.roll(np.arange(27), 26 - MIDDLE):
         row, copy = np.nonzero(joined[:, cell] & neighbours[rows, cell, None])
         place = (CELLS_AROUND[cell] + CORNERS + 1) @ NODE_STRIDE
@@ -129,7 +129,7 @@ def stencil_weights(kind: str, u: Rows, neighbours: Mask, smoothing: float = 1.0
 
     kind       : "mvc", mean value coordinates in the cell, continuous (Eq. 1-6); "cages", smooth
                  blends of coordinates in joined cells (Eq. 7-9); "affine", smooth blends of affine
-                 maps, the most accurate; "trilinear", the displacement of a solid's cell
+                 maps, the most accurate; "trilinear", the interpolation in a solid's cell
     u          : (p,3) coordinates in the cell, in [0,1]
     neighbours : (p,27) bool, whether the cell at offset (dx, dy, dz) is valid, in the column
                  (dx+1)*9 + (dy+1)*3 + (dz+1)

@@ -1,22 +1,23 @@
 """Compute the fill of cut cells and of their corners, and the second moments of their material.
 
-The fill of a corner is 8 times the integral of its trilinear function N over the inside part of
-the cell: 1 in a full cell. The mean over the 8 corners is the fill of the cell's volume. The fills
-alone spread the material too far out, so thin limbs become too stiff; second moments correct this.
+The fill of a corner is 8 times the integral of its trilinear function N over the part of the cell
+inside the surface: 1 in a full cell. The mean over the 8 corners is the filled fraction of the
+cell. The fills alone place the material too far out, so thin limbs become too stiff; second moments
+correct this.
 
 For a closed surface the fill is exact. A ray is inside the body between entering and leaving.
 The integral of N along the ray, within body and cell, is a sum over crossings with the surface.
-A crossing lies in the cell, at height z, or above it:
+A crossing lies in the cell, at height z, or above the cell:
 
     sum_in sign S(z) + sum_above sign S(1),   S' = N(z), S(0) = 0.
 
 The sign is 1 if the ray leaves and -1 if it enters. The integral over all rays is an integral over
 the triangles' pieces projected along the ray: the divergence theorem for the body within the cell.
 The second moments, integrals of x^2, y^2, z^2 from the middle of the cell, are computed alike.
-For an open surface samples of the winding number are counted (Jacobson et al. 2013).
+For an open surface, samples with a winding number above 1/2 are counted (Jacobson et al. 2013).
 
 All lengths are in cells, with axes cycled as in geometry.cages. Rays run along the last axis, so
-a slab of the first axis has whole columns of cells.
+a slab of the first axis contains whole columns of cells.
 """
 
 from dataclasses import dataclass
@@ -30,15 +31,15 @@ from msmpetsc.geometry.morton import LIMIT
 from msmpetsc.geometry.surface import Surface, is_inside
 from msmpetsc.geometry.valid_cells import clip_between, extent, grown
 
-# samples along an axis of a cut cell [-]; a plane through the cell errs by 0.6% rms
+# samples along an axis of a cut cell [-]; the fill beside a plane errs by 0.6% rms
 SAMPLES = 6
 # winding number below which a cell is outside [-]; halfway between outside and inside
 OUTSIDE = 0.5
-# winding number below a column that shows a bad winding [-]; far above rounding, far
-# below the effect of a single triangle
+# least winding number below a column that shows inconsistent winding [-]; far above
+# rounding, far below the effect of a single triangle
 LEAK = 1e-6
 
-# sums of a piece [-]; the first 6 also count for the cells below it
+# number of a piece's sums that also count for the cells below, and of all its sums [-]
 SEEN, SUMS = 6, 17
 
 # barycentric coordinates and weights of a rule of degree 4 on triangles (Dunavant 1985)
@@ -56,11 +57,11 @@ WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
 class Columns:
     """Fill of the cells that triangles cross, in lexicographic order.
 
-    keys    : (c,) of the cells (grid.packed)
+    keys    : (c,) keys of the cells (grid.packed)
     corners : (c, 2, 2, 2) fills of their corners; material inside two parts counts twice
     moments : (c, 3) second moments about the middle of the cell [cells^5]: 1/12 in a full cell
-    below   : (c, 2, 2) winding number below the cell: its mean over the base, weighted by the
-              bilinear function of each corner
+    below   : (c, 2, 2) winding number below the cell: mean over the base, weighted by the bilinear
+              function of each corner
     """
 
     keys: Indices
@@ -70,7 +71,7 @@ class Columns:
 
     @classmethod
     def crossed(cls, triangles: Rows, low: Indices, high: Indices) -> "Columns":
-        """Return the columns of triangles (f, 3, 3) in the cells low <= cell < high, (3,) int."""
+        """Return the columns of triangles (f, 3, 3) in cells low <= cell < high, (3,) int each."""
         starts = range(0, max(1, len(triangles)), CHUNK)
         pieces = (_pieces(triangles[start : start + CHUNK], low, high) for start in starts)
         parts = [_sums_of_keys(packed(cells), values) for cells, values in pieces]
@@ -118,7 +119,7 @@ def _sums_of_keys(keys: Indices, values: Rows) -> tuple[Indices, Rows]:
 
 @njit()
 def _sums_above(column: Indices, values: Rows) -> Rows:
-    """Return for each row the sum of the values (c, k) from it to the end of its column (c,)."""
+    """Return, for each row, the sum of values (c, k) from the row to the end of its column (c,)."""
     sums = values.copy()
     for c in range(len(column) - 2, -1, -1):
         if column[c] == column[c + 1]:
@@ -158,7 +159,7 @@ def _pieces(triangles: Rows, low: Indices, high: Indices) -> tuple[Indices, Rows
 
 @njit()
 def _layers(polygon: Rows, n: int, axis: int, low: Indices, high: Indices) -> tuple[int, int]:
-    """Return the first cell index of a polygon along an axis, and the index after its last."""
+    """Return the first cell index of a polygon along an axis, and its last index plus 1."""
     if n == 0:
         return 0, 0
     smallest, largest = extent(polygon, n, axis)
@@ -167,10 +168,10 @@ def _layers(polygon: Rows, n: int, axis: int, low: Indices, high: Indices) -> tu
 
 @njit()
 def _add_sums(p: Floats, q: Floats, r: Floats, cell: Indices, sums: Floats) -> None:
-    """Add the integrals over a triangle in a cell, seen along the last axis, to ``sums`` (SUMS,).
+    """Add the integrals over a triangle in a cell, projected along the last axis, to ``sums``.
 
-    z is the height in the cell, N_ab the bilinear function of the vertical edge at (a, b), which is
-    number 2 a + b. The sums are, in this order, the integrals of
+    z is the height in the cell. N_ab is the bilinear function of the vertical edge at (a, b), the
+    edge of number 2 a + b. The sums (SUMS,) are, in this order, the integrals of
 
     - N_ab (4), and x^2 and y^2 from the middle (2),
     - N_ab S with S = z - z^2/2, of the lower corners (4),
@@ -198,7 +199,7 @@ def _add_sums(p: Floats, q: Floats, r: Floats, cell: Indices, sums: Floats) -> N
 
 
 def sampled_inside(surface: Surface, grid: Grid, cells: Indices) -> tuple[Rows, Rows]:
-    """Return fills and second moments of cells (c, 3), as ``Columns.inside`` does, from samples."""
+    """Return fills (c, 2, 2, 2) and second moments (c, 3) of cells (c, 3) from samples."""
     at = (np.arange(SAMPLES) + 0.5) / SAMPLES
     # the two linear functions of an axis at the samples
     along = np.stack([1 - at, at]) / SAMPLES

@@ -1,7 +1,4 @@
-"""Number the cells and nodes of uniform grids (paper section 4.1), a grid for each body.
-
-In Morton order, cells and nodes near in space have near numbers: a range of keys is compact.
-"""
+"""Uniform grids (paper section 4.1), a grid for each body: positions and indices of their cells."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +17,7 @@ CORNERS = np.array(
 )
 # triangles or cells in a batch [-]; bounds the memory of a pass
 CHUNK = 1 << 17
-# distance at which a coordinate is moved onto a grid plane, relative to the longest
+# distance within which a coordinate is moved onto a grid plane, relative to the longest
 # side [-]; above the rounding of meshes in single precision
 ON_PLANE = 1e-6
 # upper limit of this distance [cells]; far below a cell
@@ -55,7 +52,10 @@ class Grid:
         return cls(bounds[0].copy(), float(cell_size), np.maximum(cells, 1).astype(np.int64))
 
     def to_cells(self, points: Positions) -> Rows:
-        """Return points (..., 3) [m] in cell units; the grid's last cells own its far faces."""
+        """Return points (..., 3) [m] in cell units, moved into the grid and onto near planes.
+
+        The last cells along each axis own the grid's far faces.
+        """
         inside = np.nextafter(self.shape.astype(float), 0)
         at = (points - self.origin) / self.cell_size
         plane = np.rint(at)
@@ -71,10 +71,10 @@ class Grid:
 class BodyGrids:
     """Grids of several bodies with a common cell size, numbered as a single grid.
 
-    Body b's grid is shifted by b ``room`` cells along the first axis, so no two bodies share a cell
-    or a node. ``room`` is a power of two and more than twice the longest side of any body. Hence
-    along the Morton curve body follows body, each in its own order. A cell of a coarser grid
-    belongs to a single body until it is as large as a body.
+    The grid of body b is shifted by b times ``room`` cells along the first axis. So no two bodies
+    share a cell or a node. ``room`` is a power of two, more than twice the longest side of any
+    body. Hence bodies follow each other along the Morton curve, each in its own order. A cell of a
+    coarser grid belongs to a single body until it is as large as a body.
     """
 
     grids: tuple[Grid, ...]
@@ -100,7 +100,7 @@ class BodyGrids:
 
     @cached_property
     def room(self) -> int:
-        """Cells reserved for each body along the first axis; 0, no limit, for a single body."""
+        """Cells reserved for each body along the first axis; 0 for a single body, without limit."""
         longest = max(int(grid.shape.max()) for grid in self.grids)
         return 2 << longest.bit_length() if len(self.grids) > 1 else 0
 

@@ -1,11 +1,11 @@
-"""Find the points in regions: boxes, spheres or half spaces; needs numpy alone."""
+"""Find the points in regions of space: boxes, spheres and half-spaces."""
 
 import numpy as np
 
 from msmpetsc.backend.arrays import Indices, Mask, Positions, Rows
 from msmpetsc.scene.body import Region
 
-# distance at which a point counts as on the edge, relative to the longest side [-];
+# distance within which a point counts as on the edge, relative to the longest side [-];
 # many meshes have single precision
 EDGE = 1e-6
 
@@ -13,7 +13,7 @@ EDGE = 1e-6
 def inside(region: Region, points: Positions, bounds: Rows) -> Mask:
     """Return whether points (n, 3) [m] lie in a region or on its edge, (n,) bool.
 
-    A side of a box at or beyond the body's bounding box is open, because cells stick out there.
+    A box that reaches the body's bounding box has no limit there, because cells stick out.
 
     bounds : (2, 3) the body's bounding box at rest [m]
     """
@@ -34,7 +34,7 @@ def inside(region: Region, points: Positions, bounds: Rows) -> Mask:
         )
         in_sphere: Mask = distance <= region.sphere.radius * length + edge
         return in_sphere
-    # the schema demands a shape, and regions of mesh groups do not come here
+    # the schema requires a shape, and regions of the mesh do not come here
     assert region.half_space is not None
     point = origin + np.array(region.half_space.point) * scale
     beyond: Mask = (points - point) @ np.asarray(region.half_space.normal) >= -edge

@@ -1,12 +1,12 @@
 """Sample a cell of several pieces of surface by lines, to find which pieces bound the same part.
 
-Lines of each axis cross the cell at equal distances, and their crossings form a grid of points. The
-items along a line are its ends, points, and crossings with the surface. Two items are joined if the
-line between them is inside the body, which the crossings' directions tell.
+Lines along each axis run through the cell at equal distances, and their crossings form a grid of
+points. The items along a line are its ends, points, and crossings with the surface. Two items are
+joined if the line between them is inside the body, as the directions of the crossings tell.
 
 The volume and the second moments of a part are integrals along the lines of the axis that crosses
-its pieces most often: they are exact for a wall normal to that axis. All lengths are in cells, from
-the cell's low corner.
+the part's pieces most often: they are exact for a wall normal to that axis. All lengths are in
+cells, from the cell's low corner.
 """
 
 import numpy as np
@@ -17,15 +17,15 @@ from msmpetsc.backend.trees import root
 from msmpetsc.geometry.morton import COPIES
 from msmpetsc.geometry.valid_cells import clip_between, grown
 
-# lines along each axis of a cell, in a row [-]; a part of 1/8 cell has a line
+# lines in a row along each axis of a cell [-]; a part 1/8 of a cell wide meets a line
 LINES = 8
 # place of the lines in their strips, along x, y and z [-]; unequal, so that no line
 # meets the edges of symmetric meshes
 PLACE = np.array([0.513, 0.479, 0.527])
 # tolerance of a crossing's height in a cell [cells]; rounding
 ROUNDING = 1e-9
-# kinds of an item along a line, in their order at equal heights: the surface of a slit
-# without width is left before it is entered
+# kinds of an item along a line, in their order at equal heights: at a slit without
+# width, a line leaves the body before it enters again
 START, LEAVES, POINT, ENTERS, STOP = range(5)
 
 
@@ -119,7 +119,7 @@ def _items(
 def split_cell(
     triangles: Rows, piece: Indices, flush: Array, part: Indices, faces: Array, sums: Rows
 ) -> int:
-    """Find the parts of a cell; return their number.
+    """Find the parts of the body in a cell; return their number.
 
     triangles : (t, 3, 3) in the cell, from its low corner
     piece     : (t,) piece of each triangle
@@ -178,10 +178,10 @@ def split_cell(
 def _join_unseen(
     triangles: Rows, piece: Indices, flush: Array, met: Indices, parent: Indices
 ) -> None:
-    """Join the pieces between the lines with the parts that they bound.
+    """Join the pieces that no line meets with the parts that they bound.
 
-    A ray inwards from the piece meets another piece of the part. If it meets none, the middle of
-    the ray may see a point of the grid: no surface lies between them. Else the piece is a tip.
+    A ray inwards from the piece may meet another piece of the part. If not, a grid point near the
+    middle of the ray is in the part if no surface lies between. Otherwise the piece is a tip.
     """
     pieces = len(met)
     for t in range(len(triangles)):
@@ -200,7 +200,7 @@ def _join_unseen(
 
 @njit()
 def _seen_point(triangles: Rows, start: Floats) -> int:
-    """Return a grid point among the 8 around ``start`` (3,) that no triangle hides, or -1."""
+    """Return the number of a grid point around ``start`` (3,) that no triangle hides, or -1."""
     for v in range(8):
         number, way = 0, np.empty(3)
         for axis in range(3):
@@ -217,8 +217,8 @@ def _seen_point(triangles: Rows, start: Floats) -> int:
 def _ray_inwards(triangles: Rows, t: int) -> tuple[Floats, Floats, float]:
     """Return start (3,), direction (3,) and length in the cell of a ray inwards from triangle t.
 
-    The ray begins at the middle of the triangle's part in the cell. Its length is 0 if the triangle
-    has no area in the cell.
+    The ray begins at the middle of the part of the triangle in the cell. Its length is 0 if the
+    triangle is not in the cell, or has no area.
     """
     work, part, other = np.empty((12, 3)), np.empty((12, 3)), np.empty((12, 3))
     part[:3] = triangles[t]
@@ -246,12 +246,12 @@ def _ray_inwards(triangles: Rows, t: int) -> tuple[Floats, Floats, float]:
 def _first_met(
     triangles: Rows, start: Floats, way: Floats, length: float, left_out: int
 ) -> tuple[int, float]:
-    """Return the first triangle through which a ray leaves the body, and its height on the ray.
+    """Return the first triangle through which a ray leaves the body, and the crossing's height.
 
-    If there is none, the result is -1 and the length. Moeller and Trumbore 1997.
+    If there is none, the result is -1 and ``length``. Source: Moeller and Trumbore 1997.
 
-    start, way : (3,) start of the ray inside the body, and its direction
-    length     : the greatest height, in units of the direction's length
+    start, way : (3,) start of the ray inside the body, and direction of the ray
+    length     : greatest height, in lengths of ``way``
     left_out   : triangle that does not count
     """
     met = -1
@@ -272,7 +272,10 @@ def _first_met(
 
 @njit()
 def _is_inside(kind: Indices, n: int) -> bool:
-    """Return whether a line is inside between items n - 1 and n, if its points are."""
+    """Return whether the line between items n - 1 and n may be inside the body.
+
+    If neither item is a crossing, the line is inside if its points are.
+    """
     return bool(kind[n - 1] != LEAVES and kind[n] != ENTERS)
 
 

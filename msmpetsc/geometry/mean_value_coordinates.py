@@ -4,9 +4,9 @@ A cage is a union of unit cells, so its surface consists of unit squares. Each s
 two triangles from its low to its high corner. The cut depends on the square alone, so neighbours
 cut a shared face alike.
 
-The coordinates are the same as in Ju et al. 2005, the formulas differ. On a grid the planes of
-the triangles are known exactly. So the terms that become 0/0 as p nears a plane can be removed by
-hand. The weights have full precision at any distance from faces, edges and corners.
+The coordinates are those of Ju et al. 2005, but the formulas differ. On a grid the planes of the
+triangles are known exactly. So the terms that become 0/0 as p nears a plane are cancelled by hand.
+The weights have full precision at any distance from faces, edges and corners.
 
 Let e_i = v_i - p. The mean vector of a triangle seen from p is (Eq. 4-5, not solved for w_i yet)
 
@@ -31,7 +31,7 @@ from msmpetsc.geometry.block import AROUND, CELLS, EDGE, EDGES, NODES, OF_CORNER
 Frame = tuple[float, float, float, float, float]
 Angles = tuple[float, float, float, float, float]
 Weights = tuple[float, float, float, float]
-# height below which the leading terms of the sums are removed [cells]; they cancel
+# height below which the leading terms of the sums, which cancel, are left out [cells]
 FLAT = 1e-2
 
 
@@ -39,8 +39,8 @@ class PointView(NamedTuple):
     """Geometry of a point p in its block, set by ``set_view``.
 
     planes  : (3,4) heights of the block's grid planes over p
-    angles  : (144,) g_jk of the grid edges, computed on demand; 0 if not computed
-    squares : (108,4) weights of the grid squares, computed on demand; NaN if not computed
+    angles  : (144,) g_jk of the grid edges; 0 until computed
+    squares : (108,4) weights of the grid squares; NaN until computed
     """
 
     planes: Rows
@@ -60,7 +60,7 @@ def set_view(u: Floats, view: PointView) -> None:
 
 @njit()
 def edge_angle(edge: int, view: PointView) -> float:
-    """Return g_jk of a grid edge: the angle that it subtends at p over |e_j x e_k|."""
+    """Return g_jk of a grid edge: the angle that the edge subtends at p, over |e_j x e_k|."""
     if view.angles[edge] == 0.0:
         axis, i, j, k = EDGE[edge, 0], EDGE[edge, 1], EDGE[edge, 2], EDGE[edge, 3]
         distance2 = view.planes[(axis + 1) % 3, j] ** 2 + view.planes[(axis + 2) % 3, k] ** 2
@@ -186,10 +186,10 @@ def joined_cage(corner: int, valid: Mask, view: PointView, weights: Floats) -> N
     view    : view from p
     weights : (64,) result
 
-    The 8 cells around the corner have 36 squares. The squares with a single valid side are the
-    surface of the cage, so a corner with 8 valid cells is no vertex of it. Cells that touch only
-    at an edge or a corner still have a closed surface. The weights (Eq. 1-2) have a positive sum
-    because p lies in the cage.
+    The 8 cells around the corner have 36 squares. The squares with a valid cell on a single side
+    are the surface of the cage. So a corner with 8 valid cells is no vertex of the cage. Cells that
+    touch only at an edge or a corner still have a closed surface. The weights (Eq. 1-2) have a
+    positive sum because p lies in the cage.
     """
     weights[:] = 0.0
     for s in range(36):

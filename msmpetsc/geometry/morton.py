@@ -13,9 +13,9 @@ from msmpetsc.backend.kernel import njit
 COPY_BITS = 2
 # copies at a grid index [-]
 COPIES = 1 << COPY_BITS
-# cells along the first axis [-]
+# most cells along the first axis [-]; 21 bits of a key
 LIMIT = 1 << 21
-# cells along the longest side of a body [-]
+# most cells along the longest side of a body [-]; 20 bits of a key
 SIDE_LIMIT = LIMIT >> 1
 
 

@@ -1,6 +1,6 @@
-"""Distinct keys of cells or nodes in ascending order, dealt out to the ranks in equal parts.
+"""Distribute distinct keys of cells or nodes over the ranks, in ascending order and equal parts.
 
-This is the partition of a lattice: a Morton curve gives the keys, so each part is compact.
+This is the partition of a lattice: the keys follow a Morton curve, so each part is compact.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from msmpetsc.comm import Route, starts
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-# keys sampled on each rank to choose the splitters; parts then differ by some percent
+# keys sampled per rank to choose the splitters [-]; parts then differ by some percent
 SAMPLES = 128
 
 
 def places_of(keys: Indices, wanted: Indices) -> Indices:
-    """Return the place (...,) of each wanted key in ascending keys, -1 if it is not there."""
+    """Return the place (...,) of each wanted key in ascending ``keys``; -1 for a missing key."""
     if len(keys) == 0:
         return np.full(np.shape(wanted), -1)
     place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
@@ -34,7 +34,7 @@ def ranges(first: Indices, length: Indices) -> Indices:
 
 
 def rows_of(keys: Indices, wanted: Indices) -> Indices:
-    """Return the rows of ascending ``keys`` (r,) that are a wanted key."""
+    """Return the rows of ascending ``keys`` (r,) that equal one of the wanted keys."""
     first = np.searchsorted(keys, wanted)
     return ranges(first, np.searchsorted(keys, wanted, side="right") - first)
 
@@ -67,7 +67,7 @@ class SortedKeys:
         self.total = int(counts.sum())
 
     def owner(self, keys: Indices) -> Indices:
-        """Return the rank that owns each key, or would own it."""
+        """Return the rank that owns each key, or would own a missing key."""
         return np.searchsorted(self.splitters, keys, side="right")
 
     def owner_of_index(self, index: Indices) -> Indices:
@@ -83,17 +83,18 @@ class SortedKeys:
         return index[inverse].reshape(np.shape(keys))
 
     def rows_of(self, keys: Indices, rows: Array) -> Array:
-        """Return the row of each key (k,); every key must exist (collective).
+        """Return the row of each key (k,) of any rank; every key must exist (collective).
 
-        rows : of this rank's keys, in their order
+        rows : rows of this rank's keys, in the order of ``keys``
         """
         route = Route(self.comm, self.owner(keys))
         return route.answer(rows[self._index(route.send(keys)) - self.first])
 
     def with_ghosts(self, ghosts: Indices, rows: Array) -> Array:
-        """Return rows (owned + g, ...) from rows (owned, ...) on the CPU (collective).
+        """Return this rank's rows (owned, ...) followed by the rows of ghosts (collective).
 
-        ghosts : indices (g,) of keys of other ranks, whose rows follow this rank's own
+        ghosts : global indices (g,) of keys of other ranks
+        rows   : on the CPU
         """
         to_owner = Route(self.comm, self.owner_of_index(ghosts))
         wanted = to_owner.send(ghosts) - self.first

@@ -1,4 +1,4 @@
-"""Parts of cells that hold points, and the points of parts nearest to nodes."""
+"""Find the part of a cell that holds a point, and the point of a part nearest to a node."""
 
 from dataclasses import dataclass
 
@@ -31,7 +31,7 @@ class PartsOfPoints:
     def find(self, points: Rows, ijk: Indices) -> Indices:
         """Return the part (n,) that holds each point (n, 3) [m] in its cell (n, 3).
 
-        It is the part that the nearest of the cell's triangles bounds.
+        The part is the part that the cell's nearest triangle bounds.
         """
         import igl
 
@@ -47,12 +47,12 @@ class PartsOfPoints:
         return part
 
     def nearest(self, points: Rows, ijk: Indices, part: Indices) -> Rows:
-        """Return the nearest points (n, 3) [m] of the parts around nodes at points (n, 3) [m].
+        """Return the point (n, 3) [m] nearest to each node (n, 3) [m] in the node's parts.
 
         A row is nan unless all of the node's parts are in cells of ``keys``.
 
         ijk  : (n, 8, 3) cells around each node
-        part : (n, 8) part of which the node is a corner in each cell, -1 if there is none
+        part : (n, 8) part of each cell that has the node as a corner, -1 if there is none
         """
         import igl
 
@@ -67,7 +67,7 @@ class PartsOfPoints:
             is_own = self.part[around] == of_cell[self.cell[around]]
             triangles = self.surface.triangles[self.triangle[around]]
             given = points[row : row + 1], self.surface.points
-            # a node within the body is in the part whose boundary is nearest
+            # a node inside the body is in the part whose boundary is nearest
             if not is_own.any():
                 continue
             if is_in and is_own[igl.point_mesh_squared_distance(*given, triangles)[1]]:

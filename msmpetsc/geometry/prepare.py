@@ -1,6 +1,6 @@
 """Prepare a surface: run named steps that repair, reduce, join or turn it, then scale and place it.
 
-A step is deterministic, so the results for large meshes are cached on disk.
+Steps are deterministic, so their results for large meshes are cached on disk.
 """
 
 import hashlib
@@ -34,8 +34,8 @@ from msmpetsc.geometry.surface import (
 if TYPE_CHECKING:
     import manifold3d
 
-# share of the area below which a repair has failed [-]; MeshFix keeps a few per cent of
-# overlapping parts or double-walled tubes
+# share of the area below which a repair counts as failed [-]; MeshFix keeps a few per
+# cent of overlapping parts or double-walled tubes
 LEAST_AREA_KEPT = 0.5
 # share of the area that a repair may change without a warning [-]; too little to see
 MOST_CHANGED = 0.01
@@ -58,9 +58,9 @@ def prepare(
     size: float | None = None,
     base: Sequence[float] | None = None,
 ) -> Surface:
-    """Return the surface after the steps, scaled and then moved, its groups with it.
+    """Return the surface and its groups after the steps, scaled and then moved.
 
-    steps : each the name of a step, or {name: value} for a step that takes a value (see STEPS)
+    steps : names of steps, or {name: value} for a step that takes a value (see STEPS)
     size  : longest side of the bounding box [m]; the surface is scaled about the origin
     base  : (3,) target of the middle of the bounding box's bottom face [m]
 
@@ -98,7 +98,7 @@ def largest_part(surface: Surface) -> Surface:
 
 
 def about_middle(step: Step) -> Step:
-    """Return a step with the bounding box's middle as its origin, where coordinates round least."""
+    """Return a step that works with coordinates from the bounding box's middle, to round less."""
 
     @wraps(step)
     def centred(surface: Surface, *values: Any) -> Surface:
@@ -200,7 +200,7 @@ def simplify(surface: Surface, faces: int, aggressiveness: int = 7) -> Surface:
     reduced = Surface(np.asarray(points, np.float64), np.asarray(triangles, np.int64))
     used, _ = edge_use(merged_triangles(reduced))
     if len(triangles) and examine(surface).closed and (used != 2).any():
-        # an edge collapse can pinch thin places
+        # an edge collapse may have closed up a thin place
         return repair(reduced)
     return reduced
 
@@ -222,8 +222,9 @@ def refine(surface: Surface, share: float) -> Surface:
 def orient(surface: Surface) -> Surface:
     """Wind triangles consistently and patches outwards, or inwards if a patch bounds a cavity.
 
-    A patch is connected by edges of exactly two triangles. It bounds a cavity if it lies in an odd
-    number of other patches. An open patch is turned so that most of its area faces outwards.
+    The triangles of a patch are connected by edges of exactly two triangles. A patch bounds a
+    cavity if it lies inside an odd number of other patches. An open patch is wound so that most of
+    its area faces outwards.
 
     Raises InputError if the surface has a single side.
     """
@@ -243,7 +244,10 @@ def orient(surface: Surface) -> Surface:
 
 
 def _depths(surface: Surface, patch: Indices) -> Indices:
-    """Return the number (p,) of patches around each patch of triangles (f,)."""
+    """Return, for each patch, the number (p,) of other patches that enclose it.
+
+    patch : (f,) patch of each triangle
+    """
     order = np.argsort(patch, kind="stable")
     ends = np.flatnonzero(np.diff(patch[order])) + 1
     parts = [
@@ -287,7 +291,7 @@ def _apply(surface: Surface, name: str, value: object) -> Surface:
     # the libraries do not document their exceptions on bad meshes
     except Exception as error:
         if isinstance(error, ModuleNotFoundError) and (expected := as_expected(error)):
-            # a single line names the missing extra
+            # the message is a single line that names the missing extra
             raise InputError(f"prepare: '{name}': {expected}") from error
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
         raise InputError(f"prepare: '{name}' failed ({reason})") from error
@@ -321,7 +325,7 @@ def cached(step: Step, surface: Surface, *values: object) -> Surface:
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_name(f"{path.name}.{os.getpid()}.part.npz")
         np.savez(part, points=result.points, triangles=result.triangles)
-        # renaming is atomic: a process reading meanwhile never sees half a file
+        # renaming is atomic, so no process reads half a file
         part.replace(path)
         for old in sorted(path.parent.glob("*.npz"), key=os.path.getmtime)[:-MOST_FILES]:
             old.unlink(missing_ok=True)

@@ -21,7 +21,7 @@ from msmpetsc.errors import InputError, one_line
 from msmpetsc.geometry.cell_meshes import labels_of, read_cells
 from msmpetsc.geometry.surface import Surface, compact
 
-# points (v, 3), faces (f, 3 or 4) or a list of polygons, and the faces of named groups
+# points (v, 3), faces (f, 3 or 4) or a list of polygons, and the faces of each group
 Arrays = tuple[Array, Any, Mapping[str, Any]]
 
 # properties of a PLY's faces that are colours, not labels
@@ -29,12 +29,12 @@ COLOURS = ("red", "green", "blue", "alpha")
 
 
 def read_surface(path: str | Path) -> Surface:
-    """Read PLY, OBJ, STL, OFF, GLB, glTF, mz3, VTU, VTK, MSH, INP or BDF in the file's own unit.
+    """Read a surface, in the file's own unit, in any of the formats of ``_READERS``.
 
     Polygons are cut into triangles, the parts of a GLB are joined, and volume cells give their
     boundary. The surface has the groups that the file names.
 
-    Raises InputError, a single line naming the file, if it holds no usable mesh.
+    Raises InputError, a single line that names the file, if the file holds no usable mesh.
     """
     path = Path(path)
     kind = _kind(path)
@@ -47,7 +47,7 @@ def read_surface(path: str | Path) -> Surface:
     # the message of a missing package names the extra that brings it
     except ModuleNotFoundError:
         raise
-    # on damaged files the readers raise any exception
+    # on damaged files, readers may raise any exception
     except Exception as error:
         reason = one_line(error, 120)
         raise InputError(f"{path}: not a readable {kind.upper()} mesh ({reason})") from error
@@ -80,7 +80,7 @@ def _check_arrays(path: Path, points: Positions, triangles: Indices) -> None:
 
 
 def _kind(path: Path) -> str:
-    """Return the format by a file's ending. Raises InputError if it is not read, or no file."""
+    """Return the format of a file by its ending. Raises InputError for an unknown ending."""
     kind = path.suffix.lower().removeprefix(".")
     if kind not in _READERS:
         raise InputError(f"{path}: not a mesh format that is read here ({', '.join(_READERS)})")
@@ -101,7 +101,7 @@ def _content(path: Path) -> bytes:
 
 @contextmanager
 def _silence() -> Iterator[None]:
-    """Suppress the output and the warnings of readers, but raise on half-read numbers."""
+    """Suppress the output and the warnings of readers, but raise if numpy read numbers in part."""
     with warnings.catch_warnings(), redirect_stdout(StringIO()), redirect_stderr(StringIO()):
         warnings.simplefilter("ignore")
         warnings.filterwarnings("error", message="string or file could not be read")
@@ -130,7 +130,7 @@ def _read_ply(path: Path, data: bytes) -> Arrays:
 
 
 def _labelled(faces: Array, data: Any) -> dict[str, Array]:
-    """Return the faces (f, k) of each label in a PLY; integers that are no colours are labels."""
+    """Return the faces (f, k) of each label in a PLY: integers of faces, except their colours."""
     names = data if isinstance(data, dict) else data.dtype.names
     # in an ASCII file such a column is (f, 1)
     columns = {name: np.ravel(data[name]) for name in names if name not in COLOURS}
@@ -151,7 +151,7 @@ def _read_mixed_ply(data: bytes) -> Arrays:
 def _read_obj(path: Path, data: bytes) -> Arrays:
     """Read points, polygons and groups of an OBJ.
 
-    A negative number counts back from the newest point. trimesh and meshio take it as an absolute
+    A negative number counts back from the newest point. trimesh and meshio read it as an absolute
     number, and refuse tabs or comments at line ends.
     """
     points: list[list[float]] = []

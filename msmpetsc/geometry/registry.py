@@ -1,11 +1,11 @@
 """Find named meshes: their sources and licences (registry.toml), and their files on this machine.
 
 A name gives the same body from each source. A converted copy, in $MSMPETSC_MESH_DIR or in an
-installed package, is taken as it is. A fetched original goes through the model's own steps first.
-All files are checked by SHA-256, and all give single precision.
+installed package, is used as it is. A fetched original first goes through the model's own steps.
+All files are checked by SHA-256, and all coordinates are rounded to single precision.
 
-The points have the same numbers too, except in lung, whose copy was reordered. The fetched dragon
-has the same shape and number of triangles as its copy, but another decimator made the copy.
+The points also have the same numbering, except for lung, whose copy was reordered. The fetched
+dragon has the shape and the number of triangles of its copy, but another decimator made the copy.
 """
 
 import os
@@ -47,7 +47,7 @@ class NamedMesh:
 
 
 class MeshFile(NamedTuple):
-    """A file that holds a named mesh, the steps it still needs, and where it was found."""
+    """A file of a named mesh, the prepare steps that it still needs, and where it was found."""
 
     path: Path
     steps: tuple[str | dict[str, Any], ...]
@@ -73,15 +73,18 @@ def locate(source: str, folder: str | Path) -> Path:
 
 
 def load(source: str, folder: str | Path) -> Surface:
-    """Return the surface of a registry name or a path, after the model's own steps."""
-    # imports trimesh: a third of a second, which only the reading rank shall pay
+    """Return the surface of a registry name, after the model's own steps, or of a path.
+
+    Raises InputError if the mesh is missing, differs from the registry's, or cannot be read.
+    """
+    # imported here because it imports trimesh, which ``msmpetsc fetch`` does not need
     from msmpetsc.geometry.readers import read_surface
 
     if source not in MODELS:
         return read_surface(locate(source, folder))
     file = _require(source)
     surface = prepare(read_surface(file.path), file.steps)
-    # copies hold single precision, some originals double
+    # copies have single precision, some originals double precision
     return Surface(surface.points.astype(np.float32).astype(np.float64), surface.triangles)
 
 
@@ -102,7 +105,7 @@ def find(name: str) -> MeshFile | None:
         first, *_ = (_checked(name, path, sha256) for path, sha256 in fetched.items())
         return MeshFile(first, model.steps, "fetched")
     package, _, path = model.packaged.partition("/")
-    # this does not import the package's code
+    # find_spec does not import the package's code
     spec = find_spec(package) if package else None
     for folder in (spec and spec.submodule_search_locations) or ():
         file = os.path.join(folder, path)

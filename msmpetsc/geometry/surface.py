@@ -9,8 +9,8 @@ from msmpetsc.backend.arrays import Array, Indices, Mask, Positions, Rows
 from msmpetsc.comm import starts
 from msmpetsc.errors import InputError
 
-# thickness below which a body is flat, relative to its longest side [-]; ten times the
-# rounding of coordinates in single precision
+# thickness below which a body counts as flat, relative to its longest side [-]; ten
+# times the rounding of coordinates in single precision
 FLAT = 1e-6
 
 
@@ -47,13 +47,13 @@ def joined(surfaces: Sequence[Surface]) -> Surface | None:
 
 
 def compact(points: Positions, triangles: Indices) -> Surface:
-    """Return the surface of these triangles and only their points, in the given order."""
+    """Return the surface of these triangles, with only the points that they use, in order."""
     used, numbers = np.unique(triangles, return_inverse=True)
     return Surface(points[used], numbers.reshape(-1, 3))
 
 
 def outward(surface: Surface) -> Rows:
-    """Return the outward unit normals (v, 3) at the points of a closed surface of any winding."""
+    """Return outward unit normals (v, 3) at the points of a closed, consistently wound surface."""
     a, b, c = surface.points[surface.triangles].transpose(1, 0, 2) - surface.points.mean(axis=0)
     areas = np.cross(b - a, c - a)
     normals = np.zeros_like(surface.points)
@@ -74,8 +74,8 @@ def bounds_of(surface: Surface) -> Rows:
 class SurfaceReport:
     """Measures of a surface, and counts of its faults.
 
-    Edges are counted after merging points of equal position, so the loose triangles of an STL may
-    be closed. Triangles that this leaves with two equal corners are dropped.
+    Points of equal position are merged before edges are counted, so the loose triangles of an STL
+    may form a closed surface. Triangles that then have two equal corners are dropped.
 
     volume : [m^3], negative if wound inwards; not meaningful if the surface is open
     area   : [m^2]
@@ -113,10 +113,11 @@ def examine(surface: Surface) -> SurfaceReport:
 
 
 def check_encloses(surface: Surface, report: SurfaceReport) -> list[str]:
-    """Return a line for each doubt about a surface's inside, with its remedy.
+    """Return a line for each fault that makes the inside of a surface doubtful, with its remedy.
 
-    Flatness is measured along the principal axes, so that a tilted sheet is found too. For a closed
-    surface the criterion is its mean thickness, 2 |volume| / area, relative to its longest side.
+    The flatness is measured along the principal axes, so that a tilted sheet also counts as flat.
+    A closed surface is also flat if its mean thickness 2 |volume| / area is at most FLAT of its
+    longest side.
 
     Raises InputError if the surface encloses no volume.
     """
@@ -147,7 +148,7 @@ def check_encloses(surface: Surface, report: SurfaceReport) -> list[str]:
 
 def is_inside(surface: Surface, points: Positions) -> Mask:
     """Return which points (n, 3) have |winding number| > 1/2 (Jacobson et al. 2013)."""
-    # imported here because only open surfaces and scenes with obstacles need it
+    # imported here because it is slow
     import igl
 
     low, high = bounds_of(surface)
@@ -176,7 +177,7 @@ def have_three_corners(triangles: Indices) -> Mask:
 
 
 def first_of_equal(points: Positions) -> Indices:
-    """Return for each point (v,) the lowest number of a point at exactly the same position."""
+    """Return, for each point (v,), the lowest number of a point at exactly the same position."""
     # a stable sort, so that equal points keep the order of their numbers
     order = np.lexsort(points.T)
     sorted_points = points[order]
@@ -188,9 +189,9 @@ def first_of_equal(points: Positions) -> Indices:
 
 
 def edge_use(triangles: Indices) -> tuple[Indices, Indices]:
-    """Return for each undirected edge (e,) its number of triangles, and of upward triangles.
+    """Return, for each undirected edge (e,), its number of triangles and of upward triangles.
 
-    An upward triangle runs along the edge from the lower to the higher point number.
+    An upward triangle has the edge from the lower to the higher point number.
     """
     if len(triangles) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)

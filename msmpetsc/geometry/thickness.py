@@ -1,14 +1,15 @@
-"""Thickness of a body, and how far its thin walls bend in a grid.
+"""Thickness of a body, and how much its thin walls bend on cells, over theory.
 
-The thickness at a point of the surface is the length of the ray inwards along the normal. For a
-slab and a ball it is exact. The largest ball inside would vanish at every edge of a box.
+The thickness at a point of the surface is the length of the ray inwards along the normal. It is
+exact for a slab and a ball. The diameter of the largest ball inside would vanish at every edge of a
+box.
 
-Points are spread evenly over the area, because walls that bend have much area for their volume. A
-weight of volume would count the few rays that run along a wall as much as all rays across it.
+Points are spread evenly over the area, because walls that bend have much area for their volume.
+Weights by volume would count the few rays along a wall as much as all rays across it.
 
-A trilinear cell bends freely along the grid. Let a wall of thickness d have a normal at an angle
-theta to the nearest axis. Its stiffness in bending grows by EXCESS (h sin(2 theta) / d)^2. The
-stiffness of springs grows by EXCESS (h / d)^2 at any angle.
+A wall along the grid bends freely on trilinear cells. Let a wall of thickness d have a normal at an
+angle theta to the nearest axis. Then its bending stiffness is too large by the fraction
+EXCESS (h sin(2 theta) / d)^2. With springs the fraction is EXCESS (h / d)^2 at any angle.
 """
 
 from collections.abc import Mapping
@@ -20,13 +21,14 @@ import trimesh
 from msmpetsc.geometry.surface import Surface, SurfaceReport, bounds_of
 from msmpetsc.scene.body import SOLID
 
-# rays [-]; the tenth is then the 9th to 11th hundredth of the area
+# number of rays [-]; it gives the thinnest tenth of the area to a hundredth
 RAYS = 4000
-# longest side that rays see [-]; libigl overlooks triangles of an area below 1e-6
+# longest side to which a body is scaled for rays [-]; libigl overlooks triangles of an
+# area below 1e-6
 SIDE = 1e6
 # start of a ray inside the surface [longest side]; above rounding, below all details
 START = 1e-9
-# excess of stiffness at d = h and 45 degrees [-]; 1.2 to 1.4 are measured
+# excess of bending stiffness at d = h and 45 degrees [-]; 1.2 to 1.4 are measured
 EXCESS = 1.25
 # share of theory below which bending is too little [-]; a wall of three cells has 0.9
 ENOUGH = 0.9
@@ -38,9 +40,9 @@ ADVISED = 0.91
 class Thickness:
     """Thickness of a body.
 
-    median : half of the surface is thinner [m]
-    thin   : a tenth of the surface is thinner [m]
-    askew  : the same of the thickness over sin(2 theta) [m]; huge along the grid
+    median : thickness below which half of the surface is [m]
+    thin   : thickness below which a tenth of the surface is [m], the "thin tenth"
+    askew  : like ``thin``, for the thickness over sin(2 theta) [m]; huge for walls along the grid
     """
 
     median: float
@@ -48,7 +50,7 @@ class Thickness:
     askew: float
 
     def bending(self, cell_size: float, law: str) -> float:
-        """Estimate how far the thin tenth bends on cells of side h [m], over theory [-]."""
+        """Estimate how much the thin tenth bends on cells of side h [m], over theory [-]."""
         return float(1 / (1 + EXCESS * (cell_size / self._thin(law)) ** 2))
 
     def advised_size(self, law: str) -> float:
@@ -56,7 +58,7 @@ class Thickness:
         return float(self._thin(law) * np.sqrt((1 / ADVISED - 1) / EXCESS))
 
     def cells(self, cell_size: float) -> dict[str, float]:
-        """Return the median and the thin tenth in cells of side h [m]."""
+        """Return the thicknesses "median" and "thin" in cells of side h [m]."""
         return {"median": self.median / cell_size, "thin": self.thin / cell_size}
 
     def _thin(self, law: str) -> float:
@@ -94,7 +96,7 @@ def thickness_of(surface: Surface, report: SurfaceReport) -> Thickness | None:
         return None
     length = (length[met] + START * SIDE) / scale
     along = (inwards[met] ** 2).max(axis=1)
-    # rounding leaves walls along the grid a sine of 3e-8 or more
+    # the sine is at least 3e-8, also for walls along the grid
     sine = 2 * np.sqrt(along * np.maximum(1 - along, np.finfo(float).eps))
     thin, median = np.quantile(length, [0.1, 0.5])
     return Thickness(float(median), float(thin), float(np.quantile(length / sine, 0.1)))

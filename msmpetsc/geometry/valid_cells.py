@@ -1,10 +1,11 @@
-"""Find the valid cells (paper section 4.1): cells that triangles touch, and cells enclosed by them.
+"""Find the valid cells (paper section 4.1): cells that triangles touch, and gaps between them.
 
-Everything is in cell units: cell (i, j, k) is the box [i, i+1) x [j, j+1) x [k, k+1). A cell owns
-its low faces, so a face of the body in a grid plane marks a single layer of cells.
+All lengths are in cells: cell (i, j, k) is the box [i, i+1) x [j, j+1) x [k, k+1). A cell owns its
+low faces, so a face of the body in a grid plane marks a single layer of cells.
 
 The boundary cells of a column (i, j) leave gaps between them, and each gap is inside or outside as
-a whole. So the memory follows the boundary, not the bounding box. Each rank has a slab of planes i.
+a whole. So the memory grows with the boundary, not with the bounding box. Each rank has a slab of
+planes i.
 """
 
 import numpy as np
@@ -14,13 +15,13 @@ from msmpetsc.backend.kernel import njit
 from msmpetsc.geometry.grid import PACK
 from msmpetsc.geometry.partition import ranges
 
-# rounding of an interpolated coordinate, relative to the largest [-]; an upper bound
+# upper bound of the rounding of an interpolated coordinate, over the largest [-]
 ROUNDING = 1e-12
 
 
 @njit()
 def grown(rows: Array, used: int) -> Array:
-    """Return the ``used`` first of these rows (r, n) in an array with room for another row."""
+    """Return the first ``used`` of rows (r, n), in an array with room for another row."""
     if used < len(rows):
         return rows
     larger = np.empty((2 * len(rows), rows.shape[1]), rows.dtype)
@@ -80,8 +81,9 @@ def _index_range(
 ) -> tuple[int, int]:
     """Return the first and last cell index of a part of a triangle along an axis.
 
-    ``margin`` widens the part, whose points may be interpolated, up to the triangle's own corners.
-    The corners are exact, so a triangle that ends in a grid plane does not mark the next layer.
+    ``margin`` widens the part, because its points may be interpolated, but not beyond the corners
+    of the triangle. Corners are exact, so a triangle that ends in a grid plane does not mark the
+    next layer.
     """
     smallest, largest = extent(part, n, axis)
     first, last = extent(triangle, 3, axis)

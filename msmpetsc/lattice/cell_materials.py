@@ -1,14 +1,14 @@
-"""Materials of cells that lie in parts of a scene; means in cells that an interface cuts.
+"""Materials of cells in the parts of a scene, and mean materials in cells that an interface cuts.
 
 Samples stand for the part of a cell inside the surface. A cell that an interface cuts has the
-means of E, nu and rho over its samples. So uniform strain costs the energy of the materials.
-Bending also depends on where in the cell the stiff material is. So the fills and second moments of
-the cell are those of its stiffness, with w = E / mean E at the samples:
+means of E, nu and rho over its samples. So uniform strain has the energy of the materials. Bending
+also depends on where in the cell the stiff material is. So the fills and second moments of the cell
+are weighted by stiffness, with w = E / mean E at the samples:
 
     s_v = 8 int w N_v,      int w x^2,      N_v the trilinear function of a corner.
 
-With a single material w is 1. If a material is empty, these are the numbers of a cell that the
-surface cuts (lattice.cut_cells, lattice.cell_moments).
+With a single material w is 1. If one of two materials has no stiffness, the cell is like a cell
+that the surface cuts (lattice.cut_cells, lattice.cell_moments).
 """
 
 from collections.abc import Iterator, Sequence
@@ -26,16 +26,19 @@ from msmpetsc.scene.schema import OfBody
 
 
 class Constant(NamedTuple):
-    """A material constant of cells (c,), and of the samples (k, s) of cells that are cut."""
+    """A material constant of cells (c,), and of the samples (k, s) of cells that are cut.
+
+    An interface between materials cuts these cells.
+    """
 
     of_cells: Floats
     of_samples: Rows
 
 
 def cell_materials(scene: Scene, finder: Finder) -> MaterialOfCells | None:
-    """Return the function from keys (c,) of cells to their materials (collective).
+    """Return a collective function from keys (c,) of cells to their materials.
 
-    It is None if all cells have the scene's material.
+    Return None if all cells have the scene's material.
     """
     material = scene.material
     parts = list(scene.tables("part"))
@@ -78,15 +81,15 @@ def _means(
 ) -> Constant:
     """Return a constant of cells; a cell among ``cut`` (k,) has the mean over its samples.
 
-    own_values : values of parts and the masks (c, s) of their samples; the last one counts
-    of_cells   : (c,) value outside the parts; it is changed
-    shares     : (k, s) share of each sample of the cells ``cut``
+    own_values : values of parts and the masks (c, s) of their samples; the last part takes effect
+    of_cells   : (c,) value outside the parts; changed to the result
+    shares     : (k, s) share of each sample in the cells ``cut``
     """
     of_samples = np.repeat(of_cells[cut, None], COUNT, axis=1)
     for value, mask in own_values:
         of_cells[mask.all(axis=1)] = value
         of_samples[mask[cut]] = value
-    # relative to a sample inside: equal samples have exactly their value as mean
+    # relative to a sample inside, so that equal samples give exactly their value
     first = np.take_along_axis(of_samples, shares.argmax(axis=1)[:, None], axis=1)
     of_cells[cut] = first[:, 0] + (shares * (of_samples - first)).sum(axis=1)
     return Constant(of_cells, of_samples)
@@ -103,6 +106,6 @@ def _own_values(
 
 
 def _own(own: OwnMaterial | None, material: Material, name: str) -> float:
-    """Return a constant of a body's own material, or the scene's if the body gives none."""
+    """Return a constant of a body's own material, or of the scene's if the body gives none."""
     value: float | None = getattr(own, name, None)
     return float(getattr(material, name)) if value is None else value

@@ -68,7 +68,8 @@ def forms_of(fills: Rows, moments: Rows) -> Rows:
         covariance[:, k, k] = moments[:, k] / volume[:, 0] - middle[:, k] ** 2
     for k, (i, j) in enumerate(PAIRS):
         covariance[:, i, j] = covariance[:, j, i] = products[:, k] - middle[:, i] * middle[:, j]
-    # Fills are cut at 1 if bodies overlap: a covariance may then be indefinite.
+    # where parts of a body overlap, fills are clipped to 1: the covariance may then be
+    # indefinite
     values, vectors = np.linalg.eigh(covariance)
     covariance = (vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1)
     x, y, z = covariance[:, range(3), range(3)].T
@@ -80,9 +81,9 @@ def forms_of(fills: Rows, moments: Rows) -> Rows:
 
 
 def slopes_and_modes(forms: Rows) -> tuple[Rows, Rows]:
-    """Return the operators from corner values to strain, in units of cells.
+    """Return the operators from corner values to 4 times the mean slopes, and to the modes.
 
-    They are 4 times the mean slopes (c, 3, 8), and the modes (c, 4, 8).
+    The operators are (c, 3, 8) and (c, 4, 8); lengths are in cells.
     """
     cx, cy, cz = forms[:, :3].T[:, :, None]
     xy, xz, yz = forms[:, 3:6].T[:, :, None]
@@ -107,16 +108,16 @@ def laplacians(forms: Rows, volume: Floats) -> Rows:
 
 
 def bounding_laplacians(forms: Rows, volume: Floats) -> Rows:
-    """Return matrices (c, 8, 8) no less than ``laplacians`` that bound the solid's Hessian at rest.
+    """Return matrices (c, 8, 8), no less than ``laplacians``, that bound a solid's Hessian at rest.
 
-    With the module's notation, the energy of elasticity.assumed_strain at rest is for the component
-    x at most (2 mu + 3 lambda) / 16 times
+    In the module's notation, the energy of elasticity.assumed_strain at rest is, for component x,
+    at most (2 mu + 3 lambda) / 16 times
 
         4 <(d_y h_xy + d_z h_xz)^2> + 4 (C_yy + C_zz) h_yz^2 + 16 (...) XYZ^2,
 
-    and alike for y and z. If coordinates are correlated, the form of |grad u|^2 may be less. Its
-    diagonal D is then added as often as the greatest eigenvalue of D^(-1/2) (form' - form) D^(-1/2)
-    demands.
+    and likewise for y and z. If coordinates are correlated, the form of |grad u|^2 may be less than
+    this form'. Then the diagonal D of the form is added to it, times the greatest eigenvalue of
+    D^(-1/2) (form' - form) D^(-1/2) if that is positive.
     """
     form = _modes_form(forms)
     diagonal = np.diagonal(form, axis1=1, axis2=2)[:, :3]
@@ -124,7 +125,7 @@ def bounding_laplacians(forms: Rows, volume: Floats) -> Rows:
     lack = np.zeros(len(forms))
     own = forms[:, 6:9]
     for axis in range(3):
-        # The two modes that bend along the axis, and the mode that twists
+        # the two modes that bend along the axis, and the mode that twists
         bends = [k for k, pair in enumerate(PAIRS) if axis in pair]
         others = [sum(PAIRS[k]) - axis for k in bends]
         twist = 3 - sum(bends)
@@ -142,7 +143,7 @@ def bounding_laplacians(forms: Rows, volume: Floats) -> Rows:
 
 
 def _modes_form(forms: Rows) -> Rows:
-    """Return the quadratic form (c, 4, 4) of the modes in 16 times the mean square."""
+    """Return the quadratic form (c, 4, 4) of the modes: 16 times the mean square of the slopes."""
     x, y, z = forms[:, 6:9].T
     form = np.zeros((len(forms), 4, 4))
     for k, own in enumerate((x + y, x + z, y + z)):

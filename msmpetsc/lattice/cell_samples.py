@@ -12,14 +12,14 @@ from msmpetsc.lattice.cell_moments import forms_of
 
 # samples of a cell [-]
 COUNT = 64
-# samples (s, 3) of a whole cell from its middle [cells]: a lattice rule, which has 64
-# values along each axis. The share beyond a plane errs by 1.5% rms. For a plane along
-# the grid it errs by 0.8% at most, where a grid of 4^3 samples errs by 12%.
+# samples (s, 3) of a whole cell from its middle [cells]; a lattice rule with 64 values
+# along each axis. The share beyond a plane errs by 1.5% rms. For a plane along the grid
+# it errs by 0.8% at most, but by 12% with a grid of 4^3 samples.
 OF_WHOLE = (np.arange(COUNT)[:, None] * [1, 7, 23] % COUNT + 0.5) / COUNT - 0.5
 
 
 class CellSamples:
-    """Samples of cells; in a cut cell with the centroid and covariance of the part inside.
+    """Samples of cells; in a cut cell they have centroid and covariance of the part inside.
 
     ijk     : (c, 3) grid index of the cells
     body    : (c,) number of their bodies
@@ -60,7 +60,7 @@ class CellSamples:
         return places
 
     def points(self, rows: Indices) -> Iterator[tuple[Indices, Rows]]:
-        """Yield chunks (k,) of cells ``rows`` (c,) and their samples (k * s, 3) [m]."""
+        """Yield chunks (k,) of the cells ``rows`` (c,), and their samples (k * s, 3) [m]."""
         step = CHUNK // COUNT
         for start in range(0, len(rows), step):
             chunk = rows[start : start + step]
@@ -68,9 +68,9 @@ class CellSamples:
             yield chunk, self._grids.node_positions(places.reshape(-1, 3))
 
     def weighted(self, rows: Indices, weights: Rows) -> tuple[Rows, Rows]:
-        """Return fills (k, 8) and moments (k, 3) of cells (k,) whose samples have weights w.
+        """Return fills (k, 8) and moments (k, 3) of cells (k,), weighted by w at the samples.
 
-        The volume of the fills remains. With w = 1 fills and moments are exact.
+        The mean fill of a cell does not change. With w = 1 fills and moments are exact.
 
         weights : (k, s) share of each sample times w - 1
         """

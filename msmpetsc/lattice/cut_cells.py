@@ -1,7 +1,8 @@
 """Lumped mass and spring stiffness of a cell that the surface cuts.
 
 The fill of a corner (geometry.fill_fractions) is 8 times the integral of its trilinear function
-over the part of the cell inside the surface. A spring's stiffness over that in a whole cell is
+over the part of the cell inside the surface. The stiffness of a spring, over its stiffness in a
+whole cell, is
 
     an edge:            the integral of its bilinear function, the mean fill of its two ends;
     a face diagonal:    the integral of its face's linear function, the mean fill of 4 corners;
@@ -18,8 +19,8 @@ from msmpetsc.lattice.material import CELLS_AROUND, ISOTROPIC
 
 # kind (8, 8) of the spring between two corners [-]; 0 on the diagonal
 PAIR_KIND = ((CORNERS[:, None] - CORNERS) ** 2).sum(axis=2)
-# whether a corner's fill counts for a spring (8, 8, 8) [-]; it must agree with both
-# ends in all coordinates in which the ends agree
+# whether a corner's fill counts for a spring (8, 8, 8) [-]; the corner must agree with
+# both ends in the coordinates in which the ends agree
 COUNTED = (
     (CORNERS[:, None, None] == CORNERS) | (CORNERS[:, None, None] != CORNERS[None, :, None])
 ).all(axis=3)
@@ -38,7 +39,7 @@ def spring_fractions(fills: Rows) -> Rows:
 
 
 def mass_fractions(of_pairs: Rows) -> Rows:
-    """Return each corner's mass (c, 8) over 1/8 of a whole cell's, from ``spring_fractions``."""
+    """Return each corner's mass (c, 8) over 1/8 of a whole cell's mass, by ``spring_fractions``."""
     of_mass: Rows = np.einsum("cab,ab->ca", of_pairs, STRENGTH, optimize=True) / STRENGTH.sum(
         axis=1
     )

@@ -1,8 +1,8 @@
 """Points and triangles of the surface that the lattice carries, on any number of ranks.
 
-Points are W q, linear within a triangle. So a uniform force on a triangle acts with a third at each
-corner, and forces f on points act with W^T f on nodes. Resultant and moment are exact: each row of
-W sums to 1 and reproduces linear fields.
+Points are W q, and positions are linear within a triangle. So each corner of a triangle has a third
+of a uniform force, and forces f on points are W^T f on nodes. Resultant and moment are exact,
+because each row of W sums to 1 and reproduces linear fields.
 """
 
 from collections.abc import Sequence
@@ -22,21 +22,21 @@ from msmpetsc.lattice.region import Finder, groups_named
 from msmpetsc.scene.motion import Pressure
 from msmpetsc.scene.schema import OfBody
 
-# triangles beyond which a surface is halved no more [-]; it bounds memory
+# triangles from which a surface is not refined further [-]; bounds the memory
 MOST_TRIANGLES = 1_000_000
-# distance outside the bounds of the body that is rounding [cells]
+# distance outside the body's bounding box that counts as rounding [cells]
 EDGE = 1e-6
 NO_SURFACE = Surface(np.empty((0, 3)), np.empty((0, 3), np.int64))
 
 
 class EmbeddedPoints:
-    """Points W q of this rank, from the nodes of all ranks. All methods are collective.
+    """Points W q of this rank; their nodes may be on any rank. All methods are collective.
 
     weights : this rank's rows of W over the nodes that they need
     """
 
     def __init__(self, comm: MPI.Comm, lattice: Lattice, embedding: csr_array):
-        # a route's rows have the same type on all ranks, scipy's indices have not
+        # Route needs the same type on all ranks; scipy chooses the type by the size
         columns, local = np.unique(embedding.indices.astype(np.int64), return_inverse=True)
         shape = embedding.shape[0], len(columns)
         self.weights = csr_array((embedding.data, local.ravel(), embedding.indptr), shape=shape)
@@ -57,16 +57,20 @@ class EmbeddedPoints:
 
 
 class SurfacePart:
-    """Edges or triangles of a surface, with c corners, shared out to ranks. Calls are collective.
+    """Faces of a surface, edges (c = 2) or triangles (c = 3), distributed over the ranks.
 
-    W is trilinear, whatever coordinates draw the surface. So the work of a load is that on the
-    cells themselves, and a uniform traction leaves a nearly uniform stress.
+    W is trilinear here, whatever embedding draws the surface. So a load does the same work on the
+    surface as on the cells, and a uniform traction gives a nearly uniform stress. All calls are
+    collective.
 
     rest : (c, f, 3) [m] corners at rest
     """
 
     def __init__(self, finder: Finder, lattice: Lattice, corners: Sequence[Sequence[Positions]]):
-        """Share out faces on rank 0: for each corner, for each body (f, 3) [m]."""
+        """Distribute faces of rank 0.
+
+        corners : for each of c corners, for each body, the points (f, 3) [m]
+        """
         parts = [embed(of, finder.cages, lattice.table, "trilinear") for of in corners]
         self.corners = len(parts)
         self.points = EmbeddedPoints(finder.comm, lattice, csr_array(vstack(parts)))
@@ -77,7 +81,10 @@ class SurfacePart:
         return self.points(q).reshape(self.corners, -1, 3)
 
     def to_nodes(self, forces: Rows) -> Rows:
-        """Return the forces (owned, k) on nodes of forces (c, f, k), or (f, k) on each corner."""
+        """Return the forces (owned, k) on nodes.
+
+        forces : (c, f, k) on the corners of this rank's faces, or (f, k) for all corners alike
+        """
         f, k = forces.shape[-2:]
         return self.points.to_nodes(np.broadcast_to(forces, (self.corners, f, k)).reshape(-1, k))
 
@@ -87,19 +94,19 @@ class SurfacePart:
 
 
 def doubled_areas(corners: Rows) -> Rows:
-    """Return the normals (f, 3), twice the area long, of triangles (3, f, 3)."""
+    """Return normals (f, 3) of triangles (3, f, 3), with twice the area as length."""
     a, b, c = corners
     normals: Rows = np.cross(b - a, c - a)
     return normals
 
 
 def _refined(surface: Surface, longest: float) -> Surface:
-    """Return a surface whose triangles are halved along each edge until no edge is too long.
+    """Return a surface whose triangles are cut into four until no edge is too long.
 
-    All triangles are halved alike, so that a closed surface stays closed. The points lie on the
-    surface at rest, so that the lattice carries the inside of a large triangle, too.
+    All triangles are cut alike, so that a closed surface stays closed. The new points lie on the
+    surface at rest, so that the lattice also carries the inside of a large triangle.
 
-    longest : [m]
+    longest : longest edge [m]
     """
     points, triangles = surface.points, surface.triangles
     while 0 < len(triangles) < MOST_TRIANGLES:
@@ -113,7 +120,7 @@ def _refined(surface: Surface, longest: float) -> Surface:
 
 
 def _open_edges(surface: Surface) -> Rows:
-    """Return the ends (2, e, 3) [m] of edges whose opposite edge no triangle has."""
+    """Return the ends (2, e, 3) [m] of edges that no other triangle has in reverse."""
     start = first_of_equal(surface.points)[surface.triangles]
     end, size = np.roll(start, -1, axis=1), len(surface.points)
     is_open = ~np.isin(start * size + end, end * size + start)
@@ -124,7 +131,7 @@ def _open_edges(surface: Surface) -> Rows:
 def surface_part(table: OfBody, finder: Finder, lattice: Lattice) -> SurfacePart:
     """Return the triangles in the region of a scene's table, wound outwards (collective).
 
-    A region of space has the triangles whose centroids it contains.
+    A region of space contains a triangle if it contains the triangle's centroid.
 
     Raises InputError on all ranks if the region has no triangle or leaves the cells, or if a
     pressure has no potential.
@@ -149,7 +156,7 @@ def surface_part(table: OfBody, finder: Finder, lattice: Lattice) -> SurfacePart
         inwards = finder.bodies[number].report.volume < 0
         part = compact(surface.points, surface.triangles[where][:, :: -1 if inwards else 1])
         low, high = finder.bounds[number]
-        # The grid moves points outside it to its faces.
+        # refused here, because the grid would move points outside onto its faces
         if (
             np.maximum(low - part.points, part.points - high).max(initial=0)
             > EDGE * lattice.cell_size
@@ -178,14 +185,14 @@ def surface_part(table: OfBody, finder: Finder, lattice: Lattice) -> SurfacePart
 def refuse_open(table: OfBody, edges: SurfacePart, lattice: Lattice) -> None:
     """Raise InputError if the pressure on a part with open edges has no potential (collective).
 
-    It has a potential if the part is closed, or if its edge may move only along itself: in a
-    direction, or in the plane of a symmetry that contains the edge.
+    A closed part has a potential. An open edge must be fixed, free along one axis only, or free in
+    a plane of two axes that contains the edge.
     """
     moves = (edges((~lattice.fixed).astype(float)) > 1e-9).any(axis=0)
     along = np.abs(edges.rest[1] - edges.rest[0])
     count = moves.sum(axis=1)
     leaves = np.where(moves, 0.0, along).max(axis=1) > 1e-6 * along.max(axis=1)
-    # free in two directions: the edge must not leave their plane
+    # an edge that is free along two axes must lie in their plane
     is_bad = (count == 3) | ((count == 2) & leaves)
     bad, of_all = lattice.table.comm.allreduce(np.array([is_bad.sum(), len(is_bad)]))
     if bad:

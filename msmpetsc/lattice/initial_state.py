@@ -12,7 +12,7 @@ from msmpetsc.scene.motion import Start, Twist
 
 # positions (l, 3) [m] and velocities (l, 3) [m/s], ghosts included
 InitialState = tuple[Positions, Rows]
-# returns the last state in a result file of the lattice (results.checkpoint_reader)
+# function that returns the last state in a result file (results.checkpoint_reader)
 ReadState = Callable[[str, Lattice], InitialState]
 
 
@@ -27,7 +27,8 @@ def initial_state(
     """Return initial positions and velocities of nodes from their bodies' starts (collective).
 
     starts : the start of each body; None for a body at rest
-    fixed  : (l, 3) bool, components that stay at rest in their rest positions
+    fixed  : (l, 3) bool, components of pins and anchors: without velocity, at their rest positions;
+             components of pins keep the positions of ``start.from`` instead
     bounds : (b, 2, 3) bounding box of each body at rest [m]
     """
     states = {}

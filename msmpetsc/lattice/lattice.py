@@ -1,7 +1,8 @@
-"""The lattice of a body: cell corners become masses, pairs of corners within a cell become springs.
+"""The lattice of bodies: cell corners become masses, pairs of corners in a cell become springs.
 
-Each rank holds its owned nodes, every spring of an owned node, and the ghost nodes at their other
-ends. Global node numbers follow Morton order, so they do not depend on the number of ranks.
+Each rank has its owned nodes, all springs of these nodes, and the ghosts: nodes of other ranks at
+the ends of its springs. Global node numbers follow Morton order, so they do not depend on the
+number of ranks.
 """
 
 from collections.abc import Callable
@@ -49,7 +50,7 @@ NO_SPRINGS = MadeSprings(np.empty((0, 2), np.int32), np.empty(0), np.empty(0))
 def _springs_of_solid(
     net: Topology, h: float, material: Material, of_cells: MaterialOfCells | None
 ) -> MadeSprings:
-    """Return the springs of L of a solid (collective)."""
+    """Return the springs whose L bounds a solid's Hessian at rest (collective)."""
     springs = net.springs()
     return MadeSprings.of(springs, h, stiffness_of_solid(net, springs, h, material, of_cells))
 
@@ -58,21 +59,21 @@ def _springs_of_solid(
 class Lattice:
     """This rank's part of a lattice. Local numbers begin with the ``owned`` nodes; ghosts follow.
 
-    table       : global node numbers by grid key; ``table.first`` is that of the first owned node
+    table       : global node numbers by grid key; the first owned node has ``table.first``
     nodes       : (l, 3) rest positions [m]
     ghosts      : (l - owned,) global numbers of the ghost nodes
     mass        : (owned,) [kg]
     cells       : (c, 8) global corner nodes of the cells that this rank owns
     cell_kind   : (c,) BOUNDARY or INTERIOR of geometry.cages
     springs     : (s, 2) local ends. This rank owns the first ``springs_owned``, whose first end has
-                  the lower number. The rank of the lower-numbered end owns each further spring.
-                  A solid has none of them before ``with_springs``.
+                  the lower global number. The rank of its lower-numbered end owns a further spring.
+                  A solid has no springs before ``with_springs``.
     rest_length : (s,) distance of the ends at rest [m]
     stiffness   : (s,) [N/m]
     fixed       : (l, 3) bool, components of nodes that do not move
     local_cells : (d, 8) local corner nodes of cells. The first ``cells_owned`` are the cells whose
                   first corner this rank owns. For a solid all cells around owned nodes follow.
-    cell_stiffness : (d,) stiffness of an edge inside a body of the cell's material [N/m]
+    cell_stiffness : (d,) stiffness of an edge spring inside a body of the cell's material [N/m]
     cell_fill   : (c,) fraction of each of ``cells`` that lies inside the surface [-]
     first_of_body : (b,) global number of each body's first node; a body's numbers are consecutive
     copies      : cells and nodes with copies (geometry.copies); None if there are none
@@ -80,7 +81,7 @@ class Lattice:
     volumetric  : name of a solid's volumetric energy (elasticity.neo_hookean)
     viscous     : beta / tau [-], viscosity of a step over the stiffness (elasticity.viscosity)
     pressed     : surfaces under pressure (lattice.embedded_surface.SurfacePart)
-    make_springs : makes the springs of a solid (collective); None if they are here
+    make_springs : function that makes the springs of a solid (collective); None if they are made
     """
 
     table: SortedKeys
@@ -145,13 +146,13 @@ class Lattice:
 
     @cached_property
     def rollers(self) -> tuple[Indices, ...]:
-        """Nodes (h,) and components (h,) that are fixed, of nodes that are fixed in part."""
+        """Nodes (h,) and their fixed components (h,), for nodes that are fixed in part."""
         return np.nonzero(self.fixed & ~self.pinned[:, None])
 
     def with_springs(self) -> "Lattice":
         """Return this lattice with its springs (collective).
 
-        A solid has zero-length springs, whose L bounds its Hessian at rest. They serve A alone.
+        The springs of a solid are no part of its energy: their L bounds its Hessian at rest.
         """
         if self.make_springs is None:
             return self
@@ -165,7 +166,7 @@ class Lattice:
         )
 
     def pin(self, where: Mask) -> "Lattice":
-        """Return this lattice with the nodes (l,) or components (l, 3) ``where`` fixed, too."""
+        """Return this lattice with further nodes (l,) or components (l, 3) ``where`` fixed."""
         return replace(self, fixed=self.fixed | where.reshape(len(where), -1))
 
 
@@ -177,7 +178,7 @@ def build_lattice(
 ) -> Lattice:
     """Return the lattice of the valid cells; a cut cell counts with its part inside (collective).
 
-    of_cells : material of each cell (lattice.region); None if ``material`` holds for all cells
+    of_cells : materials by key of a cell (lattice.cell_materials); None for ``material`` everywhere
     topology : topology of the cages; None to compute it
     """
     h = cages.grids.cell_size
@@ -185,7 +186,7 @@ def build_lattice(
     is_solid = material.poisson is not None
     first_owned = net.cells[:, 0] < len(net.octants)
     further = ~first_owned & is_solid
-    # a slice keeps arrays as they are, for example a row that whole cells share
+    # a slice copies nothing, so that whole cells still share one row of constants
     kept: Indices | slice = slice(None)
     if not first_owned.all():
         kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(further)])

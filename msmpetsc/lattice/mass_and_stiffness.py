@@ -1,6 +1,6 @@
 """Lumped masses of nodes and stiffnesses of springs, summed cell by cell for either law.
 
-The parts of cells that the surface cuts are those of lattice.cut_cells and lattice.cell_moments.
+lattice.cut_cells and lattice.cell_moments give the fractions of cells that the surface cuts.
 """
 
 from typing import NamedTuple
@@ -44,7 +44,7 @@ class SolidCells(NamedTuple):
     def bounds(self) -> Floats:
         """Return (2 mu + 3 lambda) V (d,) [J].
 
-        Times the mean |grad u|^2 it bounds the second variation at rest.
+        The product with the mean |grad u|^2 in a cell bounds the second variation at rest.
         """
         return (2 * self.shear + 3 * self.lame) * self.volume
 
@@ -53,9 +53,9 @@ class LawConstants(NamedTuple):
     """The material data of a rank's nodes, springs and cells.
 
     mass    : (owned,) [kg]
-    cells   : (d,) stiffness of an edge inside a body of the cell's material [N/m]
-    springs : (s,) stiffness [N/m]; empty if the law is a solid
-    solid   : (d,) constants of a solid's cells; None if the law is springs
+    cells   : (d,) stiffness of an edge spring inside a body of the cell's material [N/m]
+    springs : (s,) stiffness [N/m]; empty for a solid
+    solid   : (d,) constants of a solid's cells; None for springs
     """
 
     mass: Floats
@@ -71,7 +71,11 @@ def law_of_springs(
     material: Material,
     of_cells: MaterialOfCells | None,
 ) -> LawConstants:
-    """Return masses and spring stiffnesses; a spring has the mean over the cells that share it."""
+    """Return the masses and stiffnesses of springs (collective).
+
+    If the material gives ``stiffness``, a spring has the mean over the cells that share it. If it
+    gives Young's modulus, the spring has the sum of the cells' parts.
+    """
     owned = len(net.octants)
     made_of, fills, _ = _made_of(net, material, of_cells)
     of_pairs = spring_fractions(fills)
@@ -89,9 +93,9 @@ def law_of_springs(
 def _made_of(
     net: Topology, material: Material, of_cells: MaterialOfCells | None
 ) -> tuple[CellMaterial, Rows, Rows]:
-    """Return the material of the cells around a rank's nodes, by ``of_cells`` if it is given.
+    """Return the materials of the cells around a rank's nodes, by ``of_cells`` if it is given.
 
-    The fills and moments returned are those of the cells' stiffness (collective).
+    Also return the cells' fills and moments, weighted by stiffness (collective).
     """
     fills, moments = net.cages.materials_of(net.keys)
     if not of_cells:
@@ -107,7 +111,7 @@ def _made_of(
 def law_of_solid(
     net: Topology, h: float, material: Material, of_cells: MaterialOfCells | None
 ) -> LawConstants:
-    """Return masses and cell constants of a solid.
+    """Return masses and cell constants of a solid (collective).
 
     A corner's lumped mass is proportional to the diagonal of L, as with springs.
     """
@@ -134,7 +138,7 @@ def stiffness_of_solid(
     material: Material,
     of_cells: MaterialOfCells | None,
 ) -> Floats:
-    """Return the stiffness (s,) [N/m] of the springs of L of a solid (collective)."""
+    """Return the stiffness (s,) [N/m] of the springs whose L bounds a solid (collective)."""
     made_of, *parts = _made_of(net, material, of_cells)
     shear, lame = lame_constants(made_of.spring, made_of.poisson)
     count = len(net.cells)
@@ -143,13 +147,13 @@ def stiffness_of_solid(
     if len(cut):
         pairs = pairs.copy()
         pairs[cut] = bounding_laplacians(forms[cut], volume[cut])
-    # 2 mu + 3 lambda times |grad u|^2 bounds the second variation at rest.
+    # (2 mu + 3 lambda) |grad u|^2 bounds the second variation at rest
     return _sums_of_springs(net, springs, -h * (2 * shear + 3 * lame), pairs)
 
 
 def _forms(fills: Rows, moments: Rows) -> tuple[Rows, Floats, Indices]:
     """Return the strain forms (d, 13) and volumes (d,) [cells] of cells, and which are cut."""
-    # whole cells share a row
+    # whole cells share one row
     forms, cut = np.broadcast_to(WHOLE, (len(fills), len(WHOLE))), (fills < 1).any(axis=1)
     if cut.any():
         forms = forms.copy()
@@ -158,9 +162,9 @@ def _forms(fills: Rows, moments: Rows) -> tuple[Rows, Floats, Indices]:
 
 
 def _sums_of_springs(net: Topology, springs: SpringNet, values: Floats, weights: Rows) -> Floats:
-    """Return the weighted sum (s,) of cell ``values`` (d,) over the cells that share each spring.
+    """Return, for each spring (s,), the weighted sum of ``values`` (d,) of the cells that share it.
 
-    The order of summation does not depend on the rank.
+    The order of the sum is the same on all ranks.
 
     weights : (d, 8, 8) weight of a cell's value for the spring between two of its corners
     """

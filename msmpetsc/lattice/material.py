@@ -12,8 +12,8 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Rows
 
-# A spring's kind is its squared length in cells: 1 for an edge, 2 for a face diagonal,
-# 3 for a space diagonal.
+# The kind of a spring is its squared length in cells: 1 for an edge, 2 for a face
+# diagonal, 3 for a space diagonal.
 
 # cells that share a spring of each kind inside a body [-]
 CELLS_AROUND = np.array([0, 4, 2, 1])
@@ -42,7 +42,7 @@ class CellMaterial:
     """Material constants of cells.
 
     density : (c,) [kg/m^3]
-    spring  : (c,) Young's modulus [Pa], or spring stiffness [N/m] if the material gives it
+    spring  : (c,) Young's modulus [Pa], or else the stiffness of a spring [N/m]
     poisson : (c,) Poisson's ratio [-], unused by springs
     mixed   : cells of several stiffnesses; None if there are none
     """
@@ -60,11 +60,11 @@ MaterialOfCells = Callable[[Indices], CellMaterial]
 def calibrated_stiffness(
     young_modulus: Floats, cell_size: float, kind: Indices, cells: Indices
 ) -> Floats:
-    """Return the spring stiffnesses (s,) [N/m] of an isotropic lattice at small strain.
+    """Return the stiffness (s,) [N/m] of springs that form an isotropic lattice at small strain.
 
-    A spring's stiffness is the sum over the cells that share it, so it is less on the boundary.
+    The stiffness is a sum over the cells that share the spring, so it is less on the boundary.
 
-    young_modulus : E [Pa]; if cells differ, (s,) the mean over the cells that share each spring
+    young_modulus : E [Pa]; (s,) the mean over the cells that share each spring if cells differ
     cell_size     : h [m]
     kind          : (s,) squared length in cells
     cells         : (s,) number of valid cells that share the spring

@@ -18,8 +18,8 @@ class NodePoints(NamedTuple):
     """Nearest points of the body to nodes at rest.
 
     points  : (l, 3) [m]
-    of_part : (l,) whether the point is of the node's own parts of cells, because other parts of the
-              same cells have nodes of their own
+    of_part : (l,) whether the point is the nearest in the node's own parts of cells only; at a
+              slit, the other parts of these cells have other nodes
     """
 
     points: Positions
@@ -30,16 +30,16 @@ def nearest_of_body(bodies: Sequence[BodySurface], cages: Cages, topology: Topol
     """Return the nearest point of its body for each node at rest (collective).
 
     The nearest point is the node itself, except for corners of boundary cells, which stick out
-    of the surface by up to a cell diagonal. An obstacle should meet the surface, not the lattice.
-    So a node that sticks out by d meets the obstacle at depth d, where the surface is. This is
-    exact, for any rotation of the body, if the surface is flat over a cell. With whole cells
-    the lattice is the body, and each node is its own nearest point.
+    of the surface by up to a cell diagonal. An obstacle must meet the surface, not the lattice. So
+    a node that sticks out by d touches an obstacle only at depth d, where the surface is. This is
+    exact, for any rotation of the body, if the surface is flat over a cell. With whole cells the
+    lattice is the body, and each node is its own nearest point.
 
     A node at a slit narrower than a cell has the nearest point of its own side.
     """
     owned = topology.ijk[: len(topology.octants)]
     body = cages.grids.body_of(owned)
-    # a node shared by eight valid cells is inside, or in a narrow fold of the surface
+    # a node of eight valid cells is inside, or in a narrow fold of the surface
     is_within = topology.octants.all(axis=1) & (topology.table.keys % COPIES == 0)
     rows = np.flatnonzero(~is_within & cages.is_weighted)
     nearest = cages.grids.node_positions(owned)
@@ -61,7 +61,7 @@ def nearest_in_bodies(bodies: Sequence[BodySurface], points: Positions, body: In
 
     body : (n,) number of the body to search
     """
-    # A scene without regions and obstacles starts without igl.
+    # imported here because it is slow
     import igl
 
     to_root = Route(bodies[0].comm, np.zeros(len(points), np.int64))
@@ -70,7 +70,7 @@ def nearest_in_bodies(bodies: Sequence[BodySurface], points: Positions, body: In
     for number in np.unique(of_point):
         own = of_point == number
         surface = bodies[number].surface
-        # Rank 0 alone receives points, and it has the surfaces.
+        # only rank 0 receives points, and it has the surfaces
         assert surface is not None
         given = nearest[own]
         closest = igl.point_mesh_squared_distance(given, surface.points, surface.triangles)[2]
@@ -80,9 +80,10 @@ def nearest_in_bodies(bodies: Sequence[BodySurface], points: Positions, body: In
 
 
 def nearest_in_parts(bodies: Sequence[BodySurface], cages: Cages, keys: Indices) -> Positions:
-    """Return the points (n, 3) [m] of nodes' own parts of cells that are nearest to the nodes.
+    """Return the point (n, 3) [m] nearest to each node in the node's own parts of cells.
 
-    A row is nan for a node with a cell that other parts do not share (collective).
+    A row is nan unless each of the node's cells has several parts, or is separated from a
+    neighbour (collective).
 
     keys : (n,) keys of the nodes
     """
@@ -99,7 +100,7 @@ def nearest_in_parts(bodies: Sequence[BodySurface], cages: Cages, keys: Indices)
     )  # fmt: skip
     nearest = np.full(points.shape, np.nan)
     for number in np.unique(body):
-        # Rank 0 alone receives points, and it has the parts.
+        # only rank 0 receives points, and it has the parts
         if parts := cages.parts[number]:
             own = body == number
             nearest[own] = parts.nearest(points[own], cells[own], part[own])

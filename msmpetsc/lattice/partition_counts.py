@@ -1,4 +1,4 @@
-"""Partition of a lattice among ranks, counted without its construction on them."""
+"""Count the partition of a lattice among ranks on a single process."""
 
 from dataclasses import dataclass
 
@@ -18,8 +18,8 @@ class Partition:
     cells, nodes : owned by the rank
     ghosts       : nodes of other ranks at the far ends of its springs
     cut          : springs between an owned node and a ghost
-    nonzeros     : of the rank's rows of A, a diagonal entry and an entry for each spring of a node
-    neighbours   : ranks that own its ghosts, the number of messages in a ghost exchange
+    nonzeros     : entries in the rank's rows of A: a diagonal, and one for each spring of a node
+    neighbours   : ranks that own its ghosts: the messages in a ghost exchange
     """
 
     cells: Array
@@ -41,10 +41,10 @@ class Partition:
         return float(self.springs.sum() - self.cut.sum() / 2)
 
     def scaled(self, cells: float) -> "Partition":
-        """Return the partition of the same body with more cells on the same number of ranks.
+        """Return the partition of the same body with ``cells`` cells on the same number of ranks.
 
-        The volume part of a count grows as the cells, the surface part as their power 2/3. Ghosts
-        and cut springs grow as the nodes around a cube of a rank's nodes.
+        The volume part of a count grows as the number of cells, and the surface part as its power
+        2/3. Ghosts and cut springs grow as the nodes around a cube of a rank's nodes.
         """
         old_nodes = self.nodes.sum()
         old_cells = self.cells.sum()

@@ -28,7 +28,7 @@ def probe_points(bodies: Sequence[BodySurface], probes: Sequence[Probe]) -> list
             assert probe.point is not None
             points.append(probe.point)
             continue
-        # A scene without regions and obstacles starts without igl.
+        # imported here because it is slow
         import igl
 
         group = next(iter(groups_named(bodies, f"output.probe.{number}", probe.group).values()))
@@ -53,9 +53,9 @@ class ProbePoints:
         """
         self.comm = comm = lattice.table.comm
         at, body = np.array(points), np.full(len(points), -1)
-        # a point of several bodies belongs to the first
+        # a point in several bodies belongs to the first
         for number, grid in reversed([*enumerate(cages.grids.grids)]):
-            # rank 0 alone has the parts of cells
+            # only rank 0 has the parts of cells
             keys = comm.bcast(cells_at(cages, number, at)[0])
             moved = np.abs(grid.node_positions(grid.to_cells(at)) - at).max(axis=1)
             body[(cages.table.find(keys) >= 0) & (moved <= MOST_ON_PLANE * lattice.cell_size)] = (

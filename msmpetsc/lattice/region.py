@@ -1,9 +1,9 @@
-"""Nodes and samples of cells in the regions of a scene.
+"""Find the nodes and the samples of cells in the regions of a scene.
 
 A region selects material (README: regions and clamps):
 
 - a node, if the region contains the body's point nearest to the node;
-- also a node in the region, if the body is in the region half a cell away;
+- a node in the region, if the region also contains the body half a cell away from the node;
 - a share of a cell, by samples of the cell (lattice.cell_materials).
 """
 
@@ -29,7 +29,7 @@ from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.nearest_points import NodePoints, nearest_in_bodies
 from msmpetsc.scene.schema import OfBody
 
-# names of groups in a message [-]; more fill the screen
+# most names of groups in a message [-]; more would fill the screen
 MOST_LISTED = 20
 
 
@@ -83,10 +83,10 @@ class Finder:
         return where
 
     def _at_edge(self, table: OfBody, lattice: Lattice, outside: Mask) -> Mask:
-        """Return the nodes among ``outside`` (l,) whose body is in the region half a cell away.
+        """Return the mask (l,) of nodes in ``outside`` (l,) with the body in the region nearby.
 
-        The result is a mask (l,). The six places half a cell away lie along the grid's axes
-        (collective).
+        The body's points nearest to the six places half a cell away from the node, along the grid's
+        axes, decide (collective).
         """
         rows = np.flatnonzero(outside)
         sides = np.concatenate([np.eye(3), -np.eye(3)])
@@ -104,8 +104,8 @@ class Finder:
     def find_samples(self, table: OfBody, cells: CellSamples) -> Mask:
         """Return the mask (c, s) of the samples of cells in a region (collective).
 
-        A region of painted points has all samples of the cells that contain these points. An open
-        group has all samples of the cells that its triangles cut.
+        A region of painted points contains all samples of the cells with these points. An open
+        group contains all samples of the cells that its triangles cut.
         """
         where, keys = np.zeros((len(cells.ijk), COUNT), bool), encode_morton(cells.ijk)
         if table.table.region.painted is not None:
@@ -135,9 +135,11 @@ class Finder:
             raise InputError(f"{table.key}.region holds no part of a cell{self.extents(table)}")
 
     def shares_inside(self, cells: CellSamples, rows: Indices) -> Rows:
-        """Return the share (k, s) of each sample of cells (k,) in the part inside (collective).
+        """Return the share (k, s) of each sample in the part of its cell inside (collective).
 
-        Samples outside the surface have no share; if all are outside, all have the same.
+        Samples outside the surface have the share 0. If all are outside, all have the same share.
+
+        rows : (k,) cells
         """
         is_within = np.ones((len(rows), COUNT), bool)
         cut = cells.cut(rows)
@@ -148,7 +150,7 @@ class Finder:
         where = np.zeros(len(given), bool)
         for number in np.unique(body):
             surface = self.bodies[number].surface
-            # Rank 0 alone receives points, and it has the surfaces.
+            # only rank 0 receives points, and it has the surfaces
             assert surface is not None
             where[body == number] = is_inside(surface, given[body == number])
         is_within[np.isin(rows, cut)] = to_root.answer(where).reshape(-1, COUNT)
@@ -157,7 +159,7 @@ class Finder:
         return shares
 
     def extents(self, table: OfBody) -> str:
-        """Return the extent of a table's bodies, for a message."""
+        """Return the end of a message: the extent of a table's bodies."""
         bounds = self.bounds if table.body is None else self.bounds[[table.body]]
         low, high = (
             ", ".join(f"{x:.4g}" for x in end)
@@ -168,9 +170,9 @@ class Finder:
     def _nodes_of_mesh(self, table: OfBody, lattice: Lattice, nearest: NodePoints) -> Mask:
         """Return the mask (l,) of nodes in a region of painted points or a group (collective).
 
-        A group has the nodes that are nearest to a point of its triangles. A closed group has the
-        nodes that it encloses, too. A node at a slit narrower than a cell counts by the nearest
-        point of its own side.
+        A group contains the nodes that are nearest to a point of its triangles. A closed group also
+        contains the nodes that it encloses. At a slit narrower than a cell, the nearest point on
+        the node's own side stands for the node.
         """
         keys = lattice.table.with_ghosts(lattice.ghosts, lattice.table.keys)
         if table.table.region.group is None:
@@ -198,19 +200,19 @@ class Finder:
             self.bodies, table.key + ".region", group, table.body
         ).items():
             grid = self.cages.grids.grids[number]
-            # A node is nearest to the points of the cell centred at the node.
+            # a node is nearest to the points of the cell centred at the node
             corners = grid.to_cells(surface.points)[surface.triangles] + are_nodes / 2
             marked = marked_cells(corners, np.zeros(3, np.int64), grid.shape + 1)
             yield number, surface, encode_morton(marked + self.cages.grids.first(number))
 
     def _painted_cells(self, table: OfBody) -> Indices:
         """Return the keys (k,) of cells with painted points of a body's surface (collective)."""
-        # A table without a body is of a scene with a single body.
+        # a table without a body belongs to a scene with a single body
         key, number = table.key, table.body or 0
         surface = self.bodies[number].surface
 
         def cells() -> Indices:
-            # Rank 0 alone calls this function, and it has the surface.
+            # only rank 0 calls this function, and it has the surface
             assert surface is not None
             points = surface.points
             numbers = np.array(self._numbers(key, table.table.region.painted))
@@ -252,7 +254,7 @@ def _are_on(surface: Surface, points: Positions) -> Mask:
 def groups_named(
     bodies: Sequence[BodySurface], key: str, name: str, number: int | None = None
 ) -> dict[int, Surface]:
-    """Return the triangles of the group ``name`` by body number (collective).
+    """Return the surfaces of the group ``name`` by body number (collective).
 
     key    : key of the scene's table, for messages
     number : number of the body to search; None for all bodies
@@ -280,7 +282,7 @@ def groups_named(
 
 
 def listed(names: Sequence[str]) -> str:
-    """Return a list of at most MOST_LISTED names in printable characters, and how many follow."""
+    """Return the first MOST_LISTED names as text, and the number of further names."""
     more = len(names) - MOST_LISTED
     return ", ".join(printable(name, 60) for name in names[:MOST_LISTED]) + (
         f" and {more} more" if more > 0 else ""

@@ -22,7 +22,7 @@ class SpringNet(NamedTuple):
 
     ends    : (s, 2) local ends
     owned   : number of springs that the rank owns
-    slot    : (s,) place of each spring in the sums (owned, 27, copies) of its first end
+    slot    : (s,) flat index of each spring in sums (owned, 27, copies) by its first end
     sharing : (s,) number of cells that share each spring
     direction : (s,) direction of each spring from its first end, as in DIRECTION
     """
@@ -35,11 +35,11 @@ class SpringNet(NamedTuple):
 
 
 class Topology(NamedTuple):
-    """Nodes and cells of a rank, without material. Further fields are those of Lattice.
+    """Nodes and cells of a rank, without material; ``table`` and ``ghosts`` are as in Lattice.
 
     corners : (c, 8) global corner nodes of the cells that this rank owns
     ijk     : (l, 3) grid index of the nodes, ghosts included
-    octants : (owned, 8) bool, which of the 8 cells around each owned node have it as a corner
+    octants : (owned, 8) bool, whether each of the 8 cells around an owned node has it as a corner
     keys    : (d,) keys of all cells around the owned nodes
     cells   : (d, 8) their local corner nodes
     cages   : the cells of all ranks
@@ -72,7 +72,7 @@ class Topology(NamedTuple):
 
 
 def topology_of(cages: Cages) -> Topology:
-    """Return the nodes, cells and springs of this rank's part of the cages (collective)."""
+    """Return the nodes and cells of this rank's part of the lattice (collective)."""
     corner_keys = cages.corner_keys(cages.table.keys)
     table = SortedKeys(cages.table.comm, corner_keys.ravel())
     corners = table.find(corner_keys)
@@ -91,7 +91,7 @@ def topology_of(cages: Cages) -> Topology:
 def _cells_around(cages: Cages, table: SortedKeys) -> tuple[Indices, Mask]:
     """Return the keys (d,) of the cells around this rank's owned nodes (collective).
 
-    The mask (owned, 8) tells which of the cells have each owned node as a corner.
+    Also return the mask ``octants`` (owned, 8) of Topology.
     """
     around = encode_morton(decode_morton(table.keys)[:, None, :] - CORNERS)
     octants = cages.table.find(around) >= 0
@@ -112,10 +112,10 @@ def _cells_around(cages: Cages, table: SortedKeys) -> tuple[Indices, Mask]:
 def _neighbours(
     cells: Indices, numbers: Indices, copy: Array, owned: int
 ) -> tuple[Indices, Array, int, int]:
-    """Return the neighbours of nodes in cells, and the number of cells that share each neighbour.
+    """Return each owned node's neighbours, and the number of cells that share each neighbour.
 
-    Both are (owned, 27 copies). The last two numbers are those of the rank's springs, and of the
-    springs that it owns.
+    Both are (owned, 27 copies). Also return the number of the rank's springs, and the number of
+    springs that the rank owns.
 
     cells   : (d, 8) local corner nodes; nodes below ``owned`` are owned
     numbers : (l,) global node numbers
@@ -144,12 +144,12 @@ def _neighbours(
 def _springs(
     cells: Indices, numbers: Indices, copy: Array, owned: int
 ) -> tuple[Indices, int, Indices, Array]:
-    """Return SpringNet's fields without the directions; for the arguments see ``_neighbours``."""
+    """Return the fields of SpringNet except the directions; arguments as in ``_neighbours``."""
     neighbour, sharing, count, _ = _neighbours(cells, numbers, copy, owned)
     springs = np.empty((count, 2), np.int32)
     slot = np.empty(count, np.int64)
     shared = np.empty(count, np.uint8)
-    # Owned springs fill the arrays from the front, all further springs from the back.
+    # owned springs fill the arrays from the front, all further springs from the back
     low, high = 0, count
     for node in range(owned):
         places = np.flatnonzero(neighbour[node] >= 0)

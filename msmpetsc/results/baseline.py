@@ -1,11 +1,11 @@
-"""Stored numbers of a run, and the tolerance within which they are compared.
+"""Stored numbers of a run, and the tolerance within which a later run must agree with them.
 
 Each step is solved to 1e-9, so that the number of ranks and the solver do not matter. Counts
-must be equal, and the numbers of the last frame must agree within a tolerance.
+must be equal, and the numbers of the last frame must agree within the tolerance.
 
-Tolerance: a step solved to the relative error e leaves an error e |x* - y| in x. The distance
-|x* - y| is at most about the largest displacement D. Through y = 2 q_n - q_(n-1) the errors add
-up to e D N (N + 1) / 2 after N steps. The tolerance is 10 times this sum, as contact and buckling
+A step solved to the relative error e leaves an error e |x* - y| in x. The distance |x* - y| is at
+most about the largest displacement D. Through y = 2 q_n - q_(n-1) the errors add up to
+e D N (N + 1) / 2 after N steps. The tolerance is 10 times this sum, because contact and buckling
 amplify differences. It is twice as large for energies and momentum, which double the relative
 error of x. The tolerance is relative to a scale for each unit:
 
@@ -35,7 +35,7 @@ NODES = 5
 Unit = Literal["m", "J", "kg m/s"]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Size = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-# largest number of steps [-]; more steps would allow any difference
+# largest number of steps [-]; with more steps any difference would be allowed
 MOST_STEPS = int((2 / (GROWTH * ERROR)) ** 0.5)
 
 
@@ -80,7 +80,7 @@ class Numbers(_Strict):
 
 
 def summary(path: Path, recipe: Recipe) -> Numbers:
-    """Return the numbers to store of a result."""
+    """Return the numbers to store for a result file."""
     with Result(path) as result:
         lattice = result.lattice
         frames = result.frames

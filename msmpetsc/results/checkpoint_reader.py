@@ -1,4 +1,4 @@
-"""Read a result file for a restart: its run and last checkpoint; check its frame and lattice."""
+"""Read an earlier run and its last checkpoint from a result file; check lattice and positions."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
@@ -22,16 +22,17 @@ from msmpetsc.results.reader import Result
 from msmpetsc.results.untrusted_file import as_python, plain_damage
 from msmpetsc.scene.reading import scene_of
 
-# largest distance of a checkpoint from a frame, in longest sides [-]; for damaged files
+# largest distance of a checkpoint from a frame, in longest sides [-]; a larger distance
+# shows a damaged file
 FARTHEST = 1e6
-# difference of equal lattices relative to the largest value [-]; the order of sums over
-# cells depends on the number of ranks
+# largest difference of equal lattices, relative to the largest value [-]; the order of
+# sums over cells depends on the number of ranks
 SAME_LATTICE = 1e-9
 
 
 @dataclass(frozen=True)
 class Earlier:
-    """The facts about the run that wrote a result file which a resumed run needs.
+    """Facts about an earlier run, from its result file, that a resumed run needs.
 
     texts      : the file's attributes that are text
     true_error : number of steps between measurements of the true error, 0 for never
@@ -66,9 +67,9 @@ class Earlier:
 
 
 def _newest_checkpoint(run: Result) -> tuple[int, Checkpoint, list[str]] | None:
-    """Return slot, step with its numbers, and row names of the newest checkpoint, or None.
+    """Return the newest checkpoint: its slot, its step and numbers, and the names of its rows.
 
-    Raises InputError if the checkpoint is incomplete.
+    Return None if there is none. Raises InputError if the checkpoint is incomplete.
     """
     stored = [name for name in CHECKPOINT if f"checkpoint/{name}" in run]
     if not stored:
@@ -91,7 +92,7 @@ def _newest_checkpoint(run: Result) -> tuple[int, Checkpoint, list[str]] | None:
 
 
 def newest_slot(steps: Indices) -> int | None:
-    """Return the slot of the newest checkpoint, given the steps (2,) of both slots, or None."""
+    """Return the slot of the newest checkpoint from the steps (2,) of both slots, or None."""
     slot = int(np.argmax(steps))
     return slot if steps[slot] >= 0 else None
 
@@ -99,7 +100,7 @@ def newest_slot(steps: Indices) -> int | None:
 def read_checkpoint(comm: MPI.Comm, path: Path, owned: int) -> Checkpoint | None:
     """Return the last checkpoint with this rank's rows, or None if there is none (collective).
 
-    owned : number of this rank's nodes, a range in the order of the ranks
+    owned : number of this rank's nodes; nodes follow each other in the order of the ranks
 
     Raises InputError if the checkpoint is incomplete or cannot be read.
     """
@@ -168,8 +169,8 @@ def refuse_changed_lattice(
 ) -> None:
     """Raise InputError if a lattice differs from the lattice in the file (collective).
 
-    lattice : this rank's rows by dataset, "lattice/nodes"
-    words   : what is wrong then
+    lattice : this rank's rows by name of a dataset, such as "lattice/nodes"
+    words   : reason given in the message
     """
     with opened_on_root(comm, path) as run:
         counts = comm.bcast(

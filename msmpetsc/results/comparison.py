@@ -1,11 +1,11 @@
 """Compare two results frame by frame, without MPI and without PETSc.
 
-Results on the same lattice are compared in all fields. The error of a field is its largest
+Results on the same lattice are compared in the fields COMPARED. The error of a field is its largest
 difference at a frame, divided by the field's scale (scripts/docs/pages/how-to/compare.md). The
 scale is taken over both runs and all compared frames. Two NaN are equal, and so are two infinities
 of the same sign.
 
-Results on different lattices of the same mesh are compared in their surfaces, point by point.
+Results on different lattices of the same mesh are compared by their surfaces only, point by point.
 Both have the same points, so nothing is projected or interpolated. The weight of a point is a third
 of the area of its triangles.
 """
@@ -21,11 +21,11 @@ from msmpetsc.results.reader import Result
 
 ENERGIES = ("kinetic", "elastic", "potential", "contact")
 COMPARED = ("position", "surface", *ENERGIES, "momentum")
-# strain of the body or a spring below which a difference is rounding [-]
+# strain of a body or a spring below which a difference counts as rounding [-]
 LEAST_STRAIN = 1e-6
-# distance within which points at rest are the same, relative to the longest side [-]
+# distance within which points at rest count as the same, over the longest side [-]
 SAME_POINT = 1e-6
-# difference within which two times are the same, relative to the frames' spacing [-]
+# difference within which two times count as the same, over the frames' spacing [-]
 SAME_TIME = 1e-6
 SURFACE_FIELDS = ("frames/surface", "surface/points", "surface/triangles")
 # name of the field of root mean square distances
@@ -77,7 +77,7 @@ class Comparison:
 def compare(a: Result, b: Result) -> Comparison:
     """Compare the fields COMPARED of two results at their common times.
 
-    Raises DifferentLattices if the lattices do not match, InputError if no time is common.
+    Raises DifferentLattices if the lattices differ, InputError if the results share no time.
     """
     refuse_different_lattices(a, b)
     either = [name for name in COMPARED if name in a.frames or name in b.frames]
@@ -104,10 +104,11 @@ def rest_of(run: Result, name: str) -> Positions | None:
 
 
 def _distances(a: Result, b: Result, name: str, pairs: Indices) -> tuple[Floats, Indices, float]:
-    """Return a field's largest difference, the row of it, (p,) each, and the field's largest size.
+    """Return the largest difference of a field and its row, (p,) each, and the largest size.
 
-    Sizes are taken over all compared frames, for positions relative to rest. The zero of the
-    potential energy is arbitrary, so its sizes are relative to the first compared frame.
+    The size is the field's largest value in all compared frames of both runs. Positions count
+    relative to rest. The zero of the potential energy is arbitrary, so potential energies count
+    relative to the first compared frame.
     """
     a_rows, b_rows = a.frames[name], b.frames[name]
     if a_rows.shape[1:] != b_rows.shape[1:]:
@@ -151,7 +152,7 @@ def _row_lengths(rows: Array) -> Floats:
 
 
 def _scales(a: Result, sizes: dict[str, float]) -> dict[str, float]:
-    """Return the scale of each field, the denominator of its errors, from the fields' sizes."""
+    """Return the scale of each field, by which its errors are divided, from the fields' sizes."""
     side = longest_side(a.lattice.nodes[:], a.body_of("lattice"))
     # energy [J] of the stiffest and longest spring at LEAST_STRAIN
     least = 0.0
@@ -230,7 +231,7 @@ def compare_surfaces(run: Result, reference: Result) -> Comparison:
     (MEAN). Both are relative to their scale [m], the largest displacement in the reference. If no
     point of the reference moves, the errors are in metres and the scale is 0.
 
-    Raises InputError if a file has no surface, the meshes differ or no time is common.
+    Raises InputError if a file has no surface, the meshes differ, or the results share no time.
     """
     refuse_different_meshes(run, reference)
     rest = reference["surface/points"][:]

@@ -19,8 +19,8 @@ from msmpetsc.errors import InputError, one_line
 def whole_file(path: Path) -> Iterator[Path]:
     """Yield a path in a temporary folder; move the file to ``path`` when it is complete.
 
-    Links are followed. A replaced file keeps its permissions, and a file that may not be written
-    stays. All output files are written this way, except results, which grow (results.writer).
+    Links are followed. A replaced file keeps its permissions, and a read-only file stays. All
+    output files are written this way, except results, which grow (results.writer).
 
     Raises InputError, with the path and the system's reason in a single line.
     """
@@ -56,9 +56,9 @@ def refuse_no_file(path: Path) -> None:
 
 
 class Storage(io.FileIO):
-    """A file for HDF5 to write to, which stores write errors instead of raising them.
+    """File for HDF5 that keeps write errors instead of raising them.
 
-    HDF5 crashes at exit if its driver raises.
+    HDF5 crashes at exit if its driver raises an error.
 
     failure : the first write error, for the writer to raise
     """
@@ -94,7 +94,7 @@ class Storage(io.FileIO):
 
 
 class Lock:
-    """A lock beside ``path`` while it is written; the system releases it if the run is killed."""
+    """Lock of a file that is being written; the system releases the lock if the run is killed."""
 
     def __init__(self, path: Path):
         """Take the lock. Raises InputError if another run holds it."""

@@ -1,4 +1,4 @@
-"""Choose the frames of a result by numbers and slices in Python's notation: "0,10:250:5,-1"."""
+"""Choose frames of a result by numbers and slices in Python's notation: "0,10:250:5,-1"."""
 
 from collections.abc import Sequence
 

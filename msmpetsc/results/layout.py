@@ -6,8 +6,8 @@ start, its chunks are allocated, and nothing is buffered.
 
 Rank 0, which has the file open, transfers the rows of one rank after another. Alternatively each
 rank writes its own rows straight to their bytes: uncompressed chunks stay at the offsets that HDF5
-gave them at the start. This needs no parallel h5py. As nothing is collective, no rank waits for
-a rank that has failed.
+gave them at the start. This needs no parallel h5py. The write is not collective, so a rank that
+fails in it keeps no other rank waiting.
 """
 
 import math
@@ -36,9 +36,9 @@ LENGTH_ALONE = "This is a netCDF dimension but not a netCDF variable."
 def open_to_write(storage: Storage, mode: str) -> h5py.File:
     """Open a new file ("w") or an existing file ("r+") so that a kill leaves it readable.
 
-    The superblock of libver "earliest" has no flag "open for writing", which would lock the file of
-    a killed run. Without a chunk cache nothing waits to be written. Without a lock other programs
-    can read a running result.
+    With libver "earliest" the superblock has no flag "open for writing", which would lock the file
+    of a killed run. Without a chunk cache, no data wait to be written. Without a lock, other
+    programs can read a running result.
     """
     return h5py.File(storage, mode, libver="earliest", rdcc_nbytes=0, locking=False)
 
@@ -151,10 +151,7 @@ def _plan_dataset(file: h5py.File, plan: Plan) -> None:
 
 
 def _name_axes(frames: h5py.Group, name: str) -> None:
-    """Attach HDF5 dimension scales to the axes of a dataset of frames.
-
-    Readers of netCDF take the names of the axes from them.
-    """
+    """Attach HDF5 dimension scales to a field of frames; they name its axes for netCDF readers."""
     for axis, (symbol, size) in enumerate(
         zip(FRAME_FIELDS[name].shape, frames[name].shape, strict=True)
     ):
@@ -225,7 +222,7 @@ def scatter_rows(
 
 
 def _parts(counts: Sequence[int]) -> Iterator[slice]:
-    """Yield the slice of all rows that each rank has."""
+    """Yield the slice of each rank in the rows of all ranks."""
     for start, count in zip(starts(np.array(counts)).tolist(), counts, strict=True):
         yield slice(start, start + count)
 

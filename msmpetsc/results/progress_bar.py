@@ -12,13 +12,13 @@ from msmpetsc.comm import log
 from msmpetsc.fields import Frame
 
 Item = TypeVar("Item")
-# least time between two lines of a log [s]; a long run's log stays short
+# least time between two lines of a log [s]; keeps the log of a long run short
 LINE_EVERY = 10.0
 LINE = "frame {n_fmt}/{total_fmt}  {rate_fmt}  {remaining} left{postfix}"
 
 
 class BatchLog:
-    """Standard error of a batch job, which prints each state of a bar as a line."""
+    """Standard error of a batch job: prints each state of the bar as a line."""
 
     def write(self, text: str) -> None:
         """Write a line, without the bar's control characters."""
@@ -47,7 +47,7 @@ class Progress:
         """Show that a frame is finished."""
         if not self._enabled:
             return
-        # created at the first frame, from which the rate of a resumed run counts
+        # created at the first frame, from where the rate of a resumed run counts
         if self._bar is None:
             bar = tqdm_logging_redirect(initial=frame.index, loggers=[log], **self._style)
             self._bar = self._shown.enter_context(bar)

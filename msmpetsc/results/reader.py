@@ -1,7 +1,7 @@
 """Read result files without MPI and without PETSc: ``msmpetsc.open``.
 
-The file is checked when it is opened (results.untrusted_file). Then all arrays are as
-`msmpetsc.fields` says.
+The file is checked when it is opened (results.untrusted_file): then all arrays have the types and
+shapes of `msmpetsc.fields`.
 """
 
 import tomllib
@@ -27,7 +27,7 @@ from msmpetsc.results.untrusted_file import (
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-# datasets of indices, with the dataset whose rows they number
+# datasets of indices, and the dataset whose rows they number
 NUMBERED = {
     "lattice/cells": "lattice/nodes",
     "lattice/springs": "lattice/nodes",
@@ -48,7 +48,7 @@ class LazyArray:
     """
 
     def __init__(self, dataset: h5py.Dataset, count: int | None = None):
-        """Wrap a dataset of which the first ``count`` rows can be read, all if None."""
+        """Wrap a dataset; only its first ``count`` rows can be read, all if None."""
         self._dataset = dataset
         self._file, self.name = dataset.file.filename, dataset.name.lstrip("/")
         self.planned: tuple[int, ...] = dataset.shape
@@ -133,9 +133,9 @@ class Frames(Arrays):
 class Result:
     """A result file opened for reading, also while a run writes it.
 
-    A file that is being written has the frames finished when it was opened. The lattice, the
-    surface and the frames hold the arrays that the file has. A file of an older version, or of a
-    scene that did not ask for an array, lacks it.
+    If a run is writing the file, only the frames finished at the opening can be read. ``lattice``,
+    ``surface`` and ``frames`` hold the arrays that the file has. A file lacks an array if its scene
+    did not ask for it, or if an older version wrote the file.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ class Result:
     frames : Frames
         The arrays of the finished frames, each read when it is indexed.
     file : h5py.File
-        The same file by h5py. Datasets that the table of fields does not list are unchecked.
+        The file as h5py opens it. Only the datasets of `msmpetsc.fields` are checked.
 
     Raises
     ------
@@ -218,7 +218,7 @@ class Result:
         return self._datasets[name]
 
     def indices(self, name: str) -> Indices:
-        """Return a dataset of node or point numbers. Raises InputError if one is out of range."""
+        """Return a dataset of node or point numbers. Raises InputError for numbers out of range."""
         rows = self[name][:].astype(np.int64)
         count = len(self[NUMBERED[name]])
         plural = NUMBERED[name].partition("/")[2]

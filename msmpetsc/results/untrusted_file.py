@@ -1,7 +1,7 @@
 """Open a result file without trusting it: a file may claim anything.
 
-The claims are checked when a file is opened, before any array is read. A hostile or damaged file
-raises an InputError of a single line.
+All claims are checked when the file is opened, before any array is read. The functions raise an
+InputError of a single line for a hostile or damaged file.
 """
 
 import math
@@ -57,7 +57,7 @@ def finished(file: h5py.File) -> int:
 
 
 def _check_is_result(path: Path, file: h5py.File) -> None:
-    """Raise InputError unless format, version and frames of a file are those of a result."""
+    """Raise InputError unless a file has the format, the version and the frames of a result."""
     name, version = (as_python(file.attrs.get(key)) for key in ("format", "format_version"))
     if not (isinstance(name, str) and name == FORMAT):
         raise InputError(
@@ -114,7 +114,7 @@ def checked_datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
 
 
 def _check_sizes(path: Path, datasets: dict[str, h5py.Dataset], count: int) -> None:
-    """Raise InputError if datasets differ in a common size, or have too few frames."""
+    """Raise InputError if datasets disagree about a common size, or have too few frames."""
     sizes: dict[str, int] = {}
     for name, dataset in datasets.items():
         for axis, (size, symbol) in enumerate(zip(dataset.shape, FIELDS[name].shape, strict=True)):

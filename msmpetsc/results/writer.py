@@ -1,12 +1,13 @@
 """Write the result file (HDF5, format_version 1): a single file of all ranks, safe against a kill.
 
 All metadata is on disk before the first frame and does not change while frames are written
-(results.layout). The data of a frame is written before its time. ``/frames/time`` starts as NaN, so
-a frame is finished if its time is finite (`finished`). The checkpoint has two slots. The older slot
-is overwritten, with step -1 meanwhile, so a whole checkpoint remains: the slot of the last step.
+(results.layout). The data of a frame are written before its time. ``/frames/time`` starts as NaN,
+so a frame is finished if its time is finite (`finished`). The checkpoint has two slots. A new
+checkpoint overwrites the older slot, whose step is -1 meanwhile. So the other slot always holds a
+complete checkpoint.
 
-A resumed run writes into the existing file if everything it needs is laid out there; so the
-metadata does not change either. Otherwise the run writes a new file, copies the frames to it, and
+A resumed run writes into the existing file if all datasets that it needs are laid out there, so
+that the metadata does not change. Otherwise it writes a new file, copies the frames to it, and
 renames it when they are complete (`Begin`).
 """
 
@@ -72,10 +73,10 @@ class Begin(Enum):
 class ResultFile:
     """The result file of a run. All ranks call every method together and raise errors together.
 
-    Until `start_frames` the file has a temporary name. If it is closed before that, it is deleted,
-    and an existing file of its name stays. A lock beside the file prevents a second run from
-    writing it at the same time, if the file system has locks. Write errors (full disk, no
-    permission) raise InputError.
+    Until `start_frames` the file has a temporary name. If it is closed before, it is deleted, and
+    an existing file of its name stays. If the file system has locks, a lock prevents a second run
+    from writing the file at the same time. Write errors (full disk, no permission) raise
+    InputError.
 
     finished : number of finished frames in the file
     """
@@ -99,10 +100,10 @@ class ResultFile:
         self._part = self.path.with_name(f"{self.path.name}.{os.getpid()}.part")
         self._comm = comm
         self._begin = begin
-        # on rank 0 only, as is its storage
+        # the file and its storage, on rank 0 only
         self._file: h5py.File | None = None
         self._storage: Storage | None = None
-        # datasets of a number for each frame, set by start_frames
+        # datasets of frames that are not distributed, except time; set by start_frames
         self._numbers: dict[str, h5py.Dataset] = {}
         # descriptor of the file on each rank, set by start_frames if all ranks reach it
         self._descriptor: int | None = None
@@ -112,7 +113,7 @@ class ResultFile:
         self._most_copied: int | None = None
         # number of rows of each rank, by the name of a distributed field
         self._rows: dict[str, list[int]] = {}
-        # inodes of the files that do not outlast the run, by path
+        # inodes of the lock and the temporary file, by path
         self._temporary: dict[Path, int] = {}
         with self._together():
             if comm.rank == 0:
@@ -128,7 +129,7 @@ class ResultFile:
         if kind is None:
             self.close()
         else:
-            # nothing collective is called, as other ranks may be elsewhere
+            # no collective call here, because other ranks may be elsewhere
             with suppress(InputError), plain_errors(self.path):
                 self._finish()
             if not getattr(error, "on_all_ranks", False):
@@ -140,9 +141,9 @@ class ResultFile:
             unlink_inode(path, inode)
 
     def write(self, name: str, rows: Array) -> None:
-        """Store the rows of all ranks, (n_local, ...) each, in order in a dataset (collective).
+        """Store the rows (n_local, ...) of all ranks, one after another, in a dataset (collective).
 
-        name : of the dataset, "lattice/nodes"; a file written in place has it already
+        name : of the dataset, "lattice/nodes"; a file written in place has the dataset already
 
         Raises InputError if the existing dataset has another shape.
         """
@@ -176,7 +177,7 @@ class ResultFile:
         count    : number of frames, frame 0 included
         nodes    : number of this rank's nodes
         optional : number of this rank's rows in the optional fields, by name: {"surface": 1000}
-        saved    : a checkpoint with the rows and numbers to lay out; None for q and q_previous
+        saved    : checkpoint with the rows and numbers to lay out; None for q and q_previous only
         """
         rows_of_ranks = self._comm.allgather({"position": nodes, **(optional or {})})
         counts = {name: [rank[name] for rank in rows_of_ranks] for name in rows_of_ranks[0]}

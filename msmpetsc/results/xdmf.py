@@ -1,4 +1,4 @@
-"""Write the XDMF 3 file of a result, by which ParaView opens the frames; it holds no data."""
+"""Write the XDMF 3 file by which ParaView opens a result; the data stay in the result file."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -81,7 +81,7 @@ def _collection(run: Result, name: str, kind: str, elements: str, points: str) -
 
 
 def _motion(run: Result, points: str, index: int, times: Floats) -> Iterator[str]:
-    """Yield the attributes of a frame that readers compute as differences of positions.
+    """Yield displacement and velocity of a frame, which readers compute from positions.
 
     The velocity is a central difference between frames, or one-sided at either end.
     """
@@ -101,7 +101,7 @@ def _motion(run: Result, points: str, index: int, times: Floats) -> Iterator[str
 def _stress(run: Result, index: int) -> Iterator[str]:
     """Yield the attributes of a frame's stress.
 
-    A tensor is stored as two vectors, as readers of XDMF differ in the order of tensor components.
+    A tensor becomes two vectors, because readers of XDMF differ in the order of its components.
     """
     for name in filter(run.frames.__contains__, STRESS):
         centre = "Cell" if "c" in FRAME_FIELDS[name].shape else "Node"
@@ -126,9 +126,9 @@ def _function(formula: str, size: str, arguments: list[str]) -> str:
 def _slab(run: Result, name: str, index: int, first: int = 0) -> str:
     """Return a reference to a frame of a field: start, stride, count and dataset.
 
-    first : first of the three columns, of a field of vectors or tensors
+    first : first of the three columns to take from a field of vectors or tensors
 
-    VTK uses the comment as the name of the slab, by which it caches.
+    The comment names the slab in VTK's cache.
     """
     more = run.frames[name].ndim == 3
     size = f"{run.frames[name].shape[1]}" + " 3" * more
@@ -142,7 +142,7 @@ def _slab(run: Result, name: str, index: int, first: int = 0) -> str:
 
 
 def _data(run: Result, name: str) -> str:
-    """Return a reference to a whole dataset, by the file's name so that both files can be moved."""
+    """Return a reference to a whole dataset, by file name, so that both files can be moved."""
     array, place = run[name], escape(f"{run.path.name}:/{name}")
     kind, shape = NUMBER_TYPES[array.dtype.kind], " ".join(map(str, array.planned))
     head = f'<DataItem Format="HDF" NumberType="{kind}" Precision="{array.dtype.itemsize}"'

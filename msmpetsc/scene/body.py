@@ -187,7 +187,7 @@ class HalfSpace(Table):
 
 
 class Region(Table):
-    """A part of space or of a mesh that selects nodes at rest; for a part, shares of cells."""
+    """A part of space or of the mesh: selects nodes at rest, or shares of cells for a part."""
 
     one_of = ("box", "sphere", "half_space", "painted", "group")
     box: Box | None = Field(
@@ -256,7 +256,7 @@ class OwnMaterial(Table):
 
 
 class PartTable(OwnMaterial):
-    """A region of another material. A place in several parts takes each key from the last."""
+    """A region of another material. In an overlap the last part that gives a key counts."""
 
     region: Region = Field(
         description="place of the part; a cell that its edge cuts has the mean by volume"

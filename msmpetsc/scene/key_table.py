@@ -1,4 +1,4 @@
-"""The keys of a scene as a table made from its schema: default, range, meaning and unit."""
+"""The table of a scene's keys, made from the schema: default, range, meaning and unit."""
 
 import re
 from collections.abc import Iterator
@@ -15,7 +15,7 @@ from msmpetsc.scene.toml import toml_value
 SCHEMA_FILE = "msmpetsc.schema.json"
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 BOUNDS = {"exclusiveMinimum": ">", "minimum": ">=", "exclusiveMaximum": "<", "maximum": "<="}
-# least bound that is not shown [-]; it only keeps numbers within their type
+# bounds from this size on are not shown [-]; they only keep numbers within their type
 HIDDEN_BOUND = 1e18
 # the number of a [[table]] in a key
 NUMBERED = re.compile(r"\.(\d+|N)(?=\.|$)")

@@ -53,8 +53,9 @@ class Swirl(Table):
 class Start(Table):
     """The state of a body at time 0: its rest shape scaled, then twisted, then scattered.
 
-    Pinned and anchored nodes stay at their rest positions without velocity. A state of another run
-    takes the place of the rest shape, also for pinned nodes; velocities are added.
+    Pinned and anchored nodes stay at their rest positions without velocity. With ``from``, the last
+    state of another run takes the place of the rest shape, also for pinned nodes; velocities are
+    added.
     """
 
     from_: FileName | None = Field(
@@ -136,7 +137,7 @@ PATH = "poses, interpolated linearly from rest at time 0; the last pose is kept"
 
 
 class Holder(Table):
-    """Nodes of which some components are no unknowns."""
+    """Nodes with held components, which are no unknowns."""
 
     fix: Components = Field(
         ("x", "y", "z"),
@@ -213,7 +214,7 @@ class Force(Table):
 
 
 class SurfaceLoad(Table):
-    """A load on the surface triangles of a region, by their centroids."""
+    """A load on the surface triangles of a region, chosen by their centroids or their group."""
 
     region: Region = Field(
         description="the triangles of the surface that the load acts on, by their centroids or by "
@@ -235,7 +236,7 @@ class SurfaceLoad(Table):
 
 
 class Traction(SurfaceLoad):
-    """A dead load: a force on each area of the surface at rest, of constant direction."""
+    """A dead load: a force per area at rest, whose direction does not turn with the surface."""
 
     value: Total = Field(
         description="traction: a constant vector, or { times = [s], values = [Pa] }, interpolated "
@@ -244,7 +245,7 @@ class Traction(SurfaceLoad):
 
 
 class Pressure(SurfaceLoad):
-    """A pressure that follows the surface. The surface must be closed, or its edge be held."""
+    """A pressure that follows the surface, which must be closed, or have an edge that pins hold."""
 
     value: Annotated[
         Annotated[float, Tag(TAGS[0])] | Annotated[PressureTable, Tag(TAGS[1])],

@@ -41,7 +41,7 @@ NEEDED = {
 
 
 class ObstacleTable(Table):
-    """A solid that bodies bounce off or are pressed by; it may move, appear and disappear."""
+    """A solid that bodies touch; it may move, appear and disappear."""
 
     shape: Literal["plane", "box", "sphere", "mesh", "function"] = Field(
         description="shape of the obstacle"

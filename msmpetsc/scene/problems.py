@@ -16,7 +16,7 @@ Broken = tuple[str, PydanticCustomError]
 
 # tags of a union of a vector and a table; pydantic adds them to the path of a key
 TAGS = ("a vector", "a table")
-# messages in words of TOML in place of Python's
+# messages that replace pydantic's, in the terms of TOML
 WORDS = {
     "missing": "required, but missing",
     "model_type": "must be a table",
@@ -25,12 +25,12 @@ WORDS = {
 
 
 def rule(words: str) -> PydanticCustomError:
-    """Return a broken rule with its message."""
+    """Return the error of a broken rule, with its message."""
     return PydanticCustomError("rule", "{words}", {"words": words})
 
 
 def unknown_key(key: Any, valid: list[str]) -> PydanticCustomError:
-    """Return the problem of a key that is not in ``valid``."""
+    """Return the error of a key that is not in ``valid``."""
     near = did_you_mean(str(key).lower()[:100], valid) or f", valid: {', '.join(valid)}"
     return PydanticCustomError("unknown_key", "{words}", {"words": f"unknown key{near}"})
 
@@ -49,7 +49,7 @@ def _words(e: ErrorDetails) -> str:
     words = WORDS.get(e["type"]) or re.sub(r"^\w+ should", "must", e["msg"])
     value = e["input"]
     tables = value if isinstance(value, tuple) else (value,)
-    # tables that were read are no longer TOML
+    # a table that was read is no longer TOML, so it is not shown
     is_read = any(isinstance(table, BaseModel) for table in tables)
     if e["type"] in ("missing", "unknown_key") or is_read:
         return words
@@ -58,7 +58,7 @@ def _words(e: ErrorDetails) -> str:
 
 
 def as_given(value: Any) -> str:
-    """Return ``value`` as a shortened line; a string keeps its form without quotes."""
+    """Return ``value`` as a line of at most 60 characters; a string has no quotes."""
     if isinstance(value, str):
         shown = " ".join(value.split())
     elif isinstance(value, float):
@@ -67,7 +67,7 @@ def as_given(value: Any) -> str:
     else:
         try:
             shown = json.dumps(value, ensure_ascii=False, default=str)
-        # Python writes no integer of over 4,300 digits
+        # Python converts no integer of over 4,300 digits
         except ValueError:
             return "a number too long to show"
     return printable(shown, 60) if len(shown) <= 60 else printable(shown, 57) + "..."

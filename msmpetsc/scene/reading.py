@@ -16,7 +16,7 @@ from msmpetsc.scene.problems import KeyPath, as_given, problem_lines
 from msmpetsc.scene.schema import SceneFile
 from msmpetsc.scene.toml import overrides_of, plain
 
-# tables that a study file has and a scene file has not
+# tables of a study file that no scene file has
 OF_STUDIES = {"scene", "sweep", "map"}
 # endings of the mesh formats that geometry/readers.py reads
 MESH_NAMES = (
@@ -29,7 +29,7 @@ Changes = Mapping[str, Any] | Iterable[str]
 class Scene(SceneFile):
     """A checked scene: its tables, its TOML text, and the folder that its paths start from.
 
-    Changes are overrides as in ``--set``: keys of a scene, with items of lists by number
+    Changes are overrides as in ``--set``: values by key, with the items of a list by number
     ("pin.0.region").
 
     Examples
@@ -63,7 +63,7 @@ class Scene(SceneFile):
     def of(
         cls, tables: Mapping[str, Any], folder: str | PathLike[str] = ".", changes: Changes = ()
     ) -> "Scene":
-        """Return a checked scene of tables, for example {"mesh": {"source": "body.obj"}, ...}.
+        """Return the checked scene of tables, for example {"mesh": {"source": "body.obj"}, ...}.
 
         Parameters
         ----------
@@ -112,7 +112,7 @@ def load_scene(path: str | Path, changes: Changes = (), by_user: bool = True) ->
     """Return the checked scene of a file.
 
     changes : overrides, applied before the check; a bare word as a value is a string
-    by_user : whether the user wrote the changes, which may then name files outside the folder
+    by_user : whether the user wrote the changes; only then they may name files outside the folder
 
     Raises InputError with a line for each problem of the scene.
     """
@@ -128,8 +128,8 @@ def scene_of(
 ) -> Scene:
     """Return the checked scene of a text, as ``load_scene`` does for a file.
 
-    path    : of the scene file, which messages name and relative paths start from
-    to_read : whether the files that the scene names will be read, and so must be allowed
+    path    : path of the scene file, for messages and for relative paths
+    to_read : whether the files that the scene names will be read; if so, each must be allowed
     """
     data = _parse(path, text)
     if "mesh" not in data and not OF_STUDIES.isdisjoint(data):
@@ -145,14 +145,14 @@ def _checked(
 ) -> tuple[Scene, Collection[KeyPath]]:
     """Return the checked scene, and the key paths that the changes set.
 
-    text : TOML text of ``data``, in which problems are located; "" for tables
+    text : TOML text of ``data``; "" for tables
 
     Raises InputError with a line for each problem.
     """
     keys = {_override(data, override): override for override in overrides_of(changes)}
     try:
         checked = SceneFile.model_validate(data)
-        # absent ``mesh`` or ``body`` stays absent
+        # only given fields, so that an absent ``mesh`` or ``body`` stays absent
         given = {name: getattr(checked, name) for name in checked.model_fields_set}
         text = tomli_w.dumps(data) if keys or not text else text
         return Scene(**given, text=text, folder=path.parent), keys

@@ -28,7 +28,7 @@ MAX_CONTRAST = 1e6
 # tables that hold nodes: a node in several tables belongs to the first
 HOLDERS = ("pin", "anchor")
 SURFACE_LOADS = ("traction", "pressure")
-# tables with a region, of a body or of the whole scene
+# tables with a region; a body or the whole scene may have them
 OF_REGIONS = ("part", *HOLDERS, "force", *SURFACE_LOADS)
 
 
@@ -104,7 +104,10 @@ def unlike_the_material(scene: Any) -> Iterator[Broken]:
 
 
 def regions_of_no_body(scene: Any) -> Iterator[Broken]:
-    """Yield a broken rule for each region of all bodies that is relative or painted."""
+    """Yield a broken rule for each relative or painted region outside the tables of a body.
+
+    The rule holds in scenes with several bodies.
+    """
     for kind in OF_REGIONS:
         for number, table in enumerate(getattr(scene, kind) if scene.body else ()):
             if table.region.relative or table.region.painted is not None:
@@ -191,7 +194,7 @@ class Picture(Table):
 
 
 def table_of_defaults(table: type[Table], description: str) -> Any:
-    """Return the field of a table that has its default values if it is absent."""
+    """Return the field of a table that takes its default values if it is absent."""
     return Field(default_factory=lambda: table.model_validate({}), description=description)
 
 
@@ -275,7 +278,7 @@ class SceneFile(Table):
         return [body.start or self.start for body in self.body] or [self.start]
 
     def tables(self, *kinds: str) -> Iterator[OfBody]:
-        """Yield the tables of each kind: the scene's own, for all bodies, then those of bodies."""
+        """Yield the tables of each kind: first the scene's own, then the tables of each body."""
         for kind in kinds:
             for number, table in enumerate(getattr(self, kind)):
                 yield OfBody((kind, number), None, table)
@@ -284,7 +287,7 @@ class SceneFile(Table):
                     yield OfBody(("body", body, kind, number), body, table)
 
     def leaves(self) -> Iterator[tuple[KeyPath, Any]]:
-        """Yield key path and value of each key that is no table."""
+        """Yield key path and value of each key whose value is no table."""
         yield from _leaves((), self.model_dump(exclude_none=True, by_alias=True))
 
     def named_files(self) -> Iterator[tuple[KeyPath, str]]:

@@ -1,4 +1,4 @@
-"""The table of simulated time, and the rules between the integrator and other tables."""
+"""The table ``time`` of a scene, and the rules between the integrator and other tables."""
 
 from collections.abc import Iterator
 from typing import Any, Final
@@ -12,7 +12,7 @@ from msmpetsc.scene.values import IntegratorName, Positive, Table, only_for
 MAX_STEPS = 10**9
 STATIC: Final = "static"
 IMPLICIT = ("implicit-euler", "bdf2")
-# keys of tables that depend on time
+# keys of loads, anchors and obstacles that vary over time
 TIME_KEYS = ("path", "times", "start", "stop")
 
 
@@ -70,10 +70,10 @@ class Time(Table):
 
 
 def one_state(data: Any) -> Any:
-    """Return the unchecked data of a scene, with step and duration added to constant statics.
+    """Return the unchecked data of a scene; add missing step and duration to a constant scene.
 
-    Statics with constant loads have a single state. If only step or duration is given, the other
-    is equal to it; if both are absent, both are 1 s.
+    A static scene with constant loads has a single state. If only step or duration is given, the
+    other is equal to it; if both are absent, both are 1 s.
     """
     time = data.get("time") if isinstance(data, dict) else None
     if not isinstance(time, dict) or time.get("integrator") != STATIC:
@@ -90,7 +90,7 @@ def one_state(data: Any) -> Any:
 
 
 def _loads(tables: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """Yield the unchecked tables of anchors, loads and obstacles, with those of each body."""
+    """Yield the unchecked tables of anchors, loads and obstacles, also from the bodies' tables."""
     for name in ("anchor", "force", "traction", "pressure", "obstacle", "body"):
         given = tables.get(name)
         for table in given if isinstance(given, list | tuple) else ():
@@ -111,7 +111,7 @@ def unlike_the_integrator(scene: Any) -> Iterator[Broken]:
             yield "obstacle", rule(f'response = "barrier" {words}')
     if integrator == STATIC:
         yield from _broken_by_statics(scene)
-    # nodes that "exchange" moves back confuse BDF2's history, and pass each other
+    # "exchange" moves nodes back: that spoils BDF2's history, and nodes pass each other
     if integrator == "bdf2" or scene.touching:
         for number, obstacle in enumerate(scene.obstacle):
             if obstacle.response == "exchange":

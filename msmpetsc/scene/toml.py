@@ -1,4 +1,4 @@
-"""Conversion of data to TOML text; imports no package beyond Python's own."""
+"""Conversion of data to TOML text; imports only Python's standard library."""
 
 import json
 from collections.abc import Iterable, Mapping
@@ -18,7 +18,7 @@ def plain(value: Any) -> Any:
 
 
 def toml_value(value: Any) -> str:
-    """Return a value as a line of TOML, without the keys whose value is None."""
+    """Return a value as a line of TOML; keys whose value is None are left out."""
     value = plain(value)
     if isinstance(value, dict):
         return (

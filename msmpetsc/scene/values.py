@@ -29,7 +29,7 @@ def _nonzero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
 
 
 def _unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:
-    # divided by the largest component first, so that no square over- or underflows
+    # divide by the largest component first, so that no square overflows or underflows
     longest = max(map(abs, _nonzero(vector)))
     x, y, z = (c / longest for c in vector)
     length = math.hypot(x, y, z)
@@ -48,7 +48,7 @@ NotNegative = Annotated[float, Field(ge=0, lt=1e60)]
 # TOML's integers have 64 bits
 Count = Annotated[int, Field(gt=0, lt=2**63)]
 T = TypeVar("T")
-# not strict, as TOML has lists but no tuples
+# not strict, because TOML has lists but no tuples
 ListOf = Annotated[tuple[T, ...], Strict(False)]
 Vector = Annotated[tuple[float, float, float], Strict(False)]
 Direction = Annotated[Vector, AfterValidator(_nonzero)]
@@ -69,7 +69,7 @@ def _printable(name: str) -> str:
 
 
 def _painted(value: Any) -> str | tuple[int, ...]:
-    """Return the name of a file of point numbers, or the numbers. Raises a broken rule."""
+    """Return the name of a file of point numbers, or the numbers; raise a broken rule."""
     if isinstance(value, str) and 0 < len(value) <= 1000:
         return _printable(value)
     numbers = isinstance(value, list | tuple) and all(
@@ -89,7 +89,9 @@ def after_start(cls: Any, stop: float | None, info: ValidationInfo) -> float | N
 
 
 def refuse_unlike(places: Sequence[float], values: Sequence[Any], name: str, of: str) -> None:
-    """Raise a broken rule unless the places of a piecewise linear function ascend, one a value.
+    """Raise a broken rule unless the places of a piecewise linear function ascend.
+
+    Each place must have a value.
 
     name, of : the keys of the places and of the values
     """
@@ -120,7 +122,7 @@ def _known_preset(name: str, info: ValidationInfo) -> str:
 
 
 def _as_name(value: Any) -> Any:
-    """Return the number of a group as its name; return any other value unchanged."""
+    """Return a number as text, as the name of a group; return any other value unchanged."""
     return str(value) if type(value) is int else value
 
 
@@ -143,7 +145,7 @@ def _one_of_in_schema(schema: dict[str, Any], table: type["Table"]) -> None:
 class Table(BaseModel):
     """Base class of the tables of a scene file.
 
-    one_of : alternative keys, of which a table must give a single key
+    one_of : alternative keys; a table must give exactly one
     """
 
     model_config = ConfigDict(
@@ -156,7 +158,7 @@ class Table(BaseModel):
     one_of: ClassVar[tuple[str, ...]] = ()
 
     def broken_rules(self) -> Iterator[Broken]:
-        """Yield the broken rules between keys that are valid by themselves."""
+        """Yield the broken rules between keys whose own values are valid."""
         return iter(())
 
     @model_validator(mode="before")
@@ -178,7 +180,7 @@ class Table(BaseModel):
 
 
 def _raise_all(data: Mapping[str, Any], broken: Iterable[Broken]) -> None:
-    """Raise the problems of keys of a table together, if there are any."""
+    """Raise all broken rules of a table together, if there are any."""
     problems = [
         InitErrorDetails(type=problem, loc=(key,), input=data[key]) for key, problem in broken
     ]

@@ -31,7 +31,7 @@ OVERRIDES = {
 CASE_COLUMNS = ("scene", "options", "label", "ranks", "repeats", "cells", *OVERRIDES)
 # override of a case whose surface is compared with its reference
 SURFACE = "output.surface=true"
-# fields of Case that leave the result as it is, or enter ``id`` in another form
+# fields of Case without effect on the result, or that enter ``id`` in another form
 OUTSIDE_ID = ("file", "label", "timeout", "reference")
 
 
@@ -50,13 +50,13 @@ class Case:
     """The settings of a run and its repeats; None leaves a choice to the scene or the program.
 
     content    : digest of the scene file and of the files that it names
-    set        : all overrides of the scene, "key.path=value"; the fields below repeat some of
-                 them as columns of the table
+    set        : all overrides of the scene, "key.path=value"; some fields below repeat an override,
+                 for a column of the table
     preset     : "" for verlet
-    substep    : upper limit [s] of verlet's substeps
+    substep    : upper limit of verlet's substeps [s]
     true_error : number of steps between measurements of the true step error
-    reference  : run whose motion is taken as exact
-    point      : point of the map; None for a case of a sweep
+    reference  : run whose motion counts as exact; None without a reference
+    point      : point of a map; None for a case of a sweep
     """
 
     scene: str
@@ -81,7 +81,7 @@ class Case:
 
     @property
     def id(self) -> str:
-        """Digest of the settings and the program's version; label and time limit do not enter."""
+        """Digest of the settings that affect the result, and of the program's version."""
         settings = {name: value for name, value in asdict(self).items() if name not in OUTSIDE_ID}
         settings |= {"version": __version__, "reference": self.reference and self.reference.id}
         return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
@@ -121,7 +121,7 @@ def launcher(ranks: int) -> list[str]:
 
 
 def command(case: Case, result: Path, measure: Path) -> list[str]:
-    """Return the command of a run that writes ``result`` and its costs, ``measure``."""
+    """Return the command of a run that writes the files ``result`` and ``measure`` (its cost)."""
     output = ("-o", str(result), "--overwrite", "--measure", str(measure))
     return [*launcher(case.ranks), *PROGRAM, *run_arguments(case, *output)]
 
@@ -143,9 +143,11 @@ def digest(file: Path, scene: Scene) -> str:
 def with_tables(
     case: Case, duration: float, every: int, scene: Scene, surface: bool = False
 ) -> Case:
-    """Return a case with the overrides of its time, solver and output tables.
+    """Return a case with overrides of the tables time, output and, except for verlet, solver.
 
-    Verlet has no solver table.
+    duration : [s]
+    every    : steps between stored frames
+    surface  : whether to store the surface
     """
     tables: dict[str, dict[str, Any]] = {
         "time": scene.time.model_dump(exclude_unset=True) | {"duration": duration},
@@ -186,7 +188,7 @@ def study_cases(study: Study, folder: Path, full: bool) -> list[Case]:
 
 
 def with_laws(scene: StudyScene, sweep: Sweep) -> Iterator[tuple[StudyScene, Sweep]]:
-    """Yield scene and sweep for each material law of the sweep, with the law in the label."""
+    """Yield scene and sweep for each material law of the sweep; the label names the law."""
     if not sweep.laws:
         yield scene, sweep
     for law in sweep.laws:
@@ -210,13 +212,13 @@ def sweep_cases(study: Study, scene: StudyScene, sweep: Sweep, folder: Path) -> 
         )  # fmt: skip
         base = replace(base, reference=_reference(base, scene, as_given))
         for case in _methods(base, scene, sweep, as_given):
-            # an error in a scene must appear before the first run
+            # an invalid scene must be refused before the first run
             load_scene(file, case.set, by_user=False)
             yield case
 
 
 def _methods(base: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Iterator[Case]:
-    """Yield the cases with the lattice and the integrator of ``base``."""
+    """Yield a case for each method of a sweep, with the lattice and the integrator of ``base``."""
     steps = sweep.time_steps or (as_given.time.step,)
     if base.integrator == "verlet":
         lists: dict[str, Sequence[Any]] = {"time_step": steps, "substep": sweep.substeps or (None,)}
@@ -245,9 +247,9 @@ def _label(sweep: Sweep, case: Case) -> str:
 
 
 def _timed(case: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Case:
-    """Return a case with its duration, and with output at the times of the reference's frames.
+    """Return a case with its duration, and with frames at the times of the reference's frames.
 
-    ``true_error`` is cut to the number of steps, so that a run measures it at least once.
+    ``true_error`` is at most the number of steps, so that a run measures at least one step.
     """
     length = Length(steps=sweep.steps) if sweep.steps else scene
     duration = length.seconds(case.time_step, as_given.time.duration)
@@ -263,9 +265,9 @@ def _timed(case: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Case
 def _reference(base: Case, scene: StudyScene, as_given: Scene) -> Case | None:
     """Return the reference run of a case, or None if the scene has no reference.
 
-    The reference has short steps and writes frames at the times that are compared. It runs on the
-    case's lattice, unless the reference has its own ``cells``: then only the scene's overrides and
-    the law apply to it, and surfaces are compared.
+    The reference has short steps, and frames at the times that are compared. It runs on the case's
+    lattice, unless it has its own ``cells``. In that case only the scene's overrides and the law
+    apply to it, and surfaces are compared.
     """
     reference = scene.reference
     if reference is None:
@@ -324,7 +326,10 @@ def map_cases(study: Study, map: Map, folder: Path) -> Iterator[Case]:
 
 
 def map_points(map: Map) -> Iterator[tuple[float | None, float | str, MapCase]]:
-    """Yield x, y and the run of each point of a map; for a named case x is None and y its name."""
+    """Yield x, y and the run of each point of a map.
+
+    For a named case, x is None and y is the name.
+    """
     for case in map.case:
         length = case if case.steps or case.duration else map
         own = {"set": (*map.set, *case.set), "steps": length.steps, "duration": length.duration}
@@ -346,7 +351,7 @@ def map_points(map: Map) -> Iterator[tuple[float | None, float | str, MapCase]]:
 
 
 def axis_changes(axis: Axis, value: float, length: Length) -> Iterator[str]:
-    """Yield the overrides of an axis; a time step as axis also sets the duration."""
+    """Yield the overrides for a value of an axis; an axis of time steps also sets the duration."""
     yield from axis.changes(value)
     if axis.key == "time.step":
         yield f"time.duration={max(length.seconds(value, value), value)!r}"

@@ -3,7 +3,7 @@
 from typing import Any
 
 PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
-# between number and unit; so that no line breaks there
+# separator of number and unit; it prevents a line break
 GAP = "\N{NO-BREAK SPACE}"
 
 
@@ -40,12 +40,12 @@ def plain(value: float | str | None) -> str:
     return f"{value:.0f}" if value == int(value) and abs(value) < 1e15 else f"{value:.4g}"
 
 
-# columns in seconds; names that begin with time_ need no entry
+# columns in seconds whose names do not begin with time_
 TIMES = ("least", "greatest", "step", "substep", "seconds")
 
 
 def worded(column: str, value: Any) -> str:
-    """Return an entry as text; the column's name decides between error, bytes, time and count."""
+    """Return an entry as text: an error, bytes, a time or a count, by the column's name."""
     if isinstance(value, str) or value is None or value != value:
         return plain(value)
     if column.endswith("error"):

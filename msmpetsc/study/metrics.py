@@ -48,7 +48,7 @@ def costs(record: dict[str, Any]) -> Row:
 
 
 def frame_metrics(result: Path, time_step: float) -> Row:
-    """Return metrics of a result file; times and iterations are means per step after start-up."""
+    """Return metrics of a result file; times and iterations are means per step without start-up."""
     with Result(result) as run:
         count = len(run.frames.time)
         series = {name: array[:] for name, array in run.frames.items() if array.ndim == 1}
@@ -57,7 +57,7 @@ def frame_metrics(result: Path, time_step: float) -> Row:
         return {"frames": count, "steps": 0} | shape
     # steps between consecutive frames
     steps = np.rint(np.diff(series["time"]) / time_step).astype(int)
-    # frame 0 is the initial state; frame 1 contains work that is done only once
+    # frame 0 is the initial state; frame 1 contains work that is done once
     start = 2 if count > 2 else 1
     known = [name for name in ("wall_time", *COUNTED) if name in series]
     mean = {name: float(series[name][start:].sum() / steps[start - 1 :].sum()) for name in known}
@@ -67,7 +67,10 @@ def frame_metrics(result: Path, time_step: float) -> Row:
 
 
 def _soundness(series: dict[str, Floats]) -> Row:
-    """Return counts of failures, final inverted cells, and, without loads, the energy left."""
+    """Return counts of failures and contacts, final inverted cells, and the energy left.
+
+    Without potential energy, the energy left is the final over the initial energy.
+    """
     row: Row = {
         name: float(np.nansum(series[name][1:]))
         for name in ("substeps", "fallbacks", "energy_gained")
@@ -89,7 +92,7 @@ def _errors(series: dict[str, Floats]) -> Row:
     """Return rms errors over the steps whose true error was measured, or else over all steps."""
     estimated, true = series["step_error"][1:], series["true_error"][1:]
     where = np.isfinite(true) if np.isfinite(true).any() else ~np.isnan(estimated)
-    # without a minimum nearby a step's estimate is infinite: the run has no estimate
+    # a step without a minimum nearby has an infinite estimate: then the run has none
     return {
         "estimated_error": None if np.isinf(estimated[where]).any() else _rms(estimated[where]),
         "true_error": _rms(true[where]),
@@ -103,9 +106,9 @@ def _rms(values: Floats) -> float | None:
 
 
 def merge_repeats(runs: Sequence[Row]) -> Row:
-    """Return a row for all repeats: medians of times, range of the time of a step, least memory.
+    """Return a row for all repeats: medians of times, the range of a step's time, least memory.
 
-    The least memory counts because the first run may store data for measuring true errors.
+    The least memory counts because the first run may also store data to measure true errors.
     """
     row = dict(runs[0])
     for name in row:
@@ -165,9 +168,9 @@ def trajectory_error(result: Path, reference: Path) -> float:
 
         sqrt( sum_times |x - x_ref|_M^2 / sum_times |x_ref - x_rest|_M^2 )
 
-    The sums run over the times that both files have. x_ref stands for the limit of the time step to
-    zero. Rigid motion of the reference counts as motion. Raises InputError if the files have fewer
-    than two common times or different lattices, or if nothing moves.
+    The sums run over the times that both files have. x_ref stands for the limit of zero time step.
+    Rigid motion of the reference counts as motion. Raises InputError if the files have fewer than
+    two common times or different lattices, or if nothing moves.
     """
     with Result(result) as run, Result(reference) as true:
         refuse_different_lattices(run, true)

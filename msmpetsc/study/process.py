@@ -1,4 +1,4 @@
-"""Child processes with time limits, ended with their descendants; the last error of their log."""
+"""Run child processes with time limits, and end them with all their descendants."""
 
 import os
 import signal
@@ -22,7 +22,11 @@ GRACE = 3.0
 
 @dataclass(frozen=True)
 class Ended:
-    """The end of a process: exit status, None after a timeout; reason, "" for status 0."""
+    """The end of a process.
+
+    status : exit status; None after a timeout
+    reason : why the process failed; "" for status 0
+    """
 
     status: int | None
     reason: str
@@ -36,7 +40,7 @@ class Ended:
 
 
 class Processes:
-    """The child processes that run at present; after ``close`` no process is started."""
+    """The running child processes; after ``close`` no process starts."""
 
     def __init__(self) -> None:
         self._running: set[subprocess.Popen[bytes]] = set()

@@ -1,4 +1,4 @@
-// A click on a heading sorts its table, a second click the other way round; empty cells stay at the end.
+// A click on a heading sorts the table, a second click reverses the order; empty cells stay at the end.
 for (const table of document.querySelectorAll("table.sortable")) {
   table.tHead.addEventListener("click", (event) => {
     const heading = event.target.closest("th");

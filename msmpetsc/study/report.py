@@ -38,7 +38,7 @@ FAILURE_COLUMNS = ["scene", "label", "time_step", "error", "status", "reason", "
 
 
 def write_report(folder: Path) -> Path:
-    """Write the charts of a folder's table.csv as PNG files and report.html; return its path.
+    """Write report.html and its charts as PNG files from a folder's table.csv; return its path.
 
     Raises InputError if the table is missing or not readable.
     """

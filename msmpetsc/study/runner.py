@@ -1,4 +1,4 @@
-"""Study runner: run the cases, compare them with their references, and keep the table current."""
+"""Run the cases of a study, compare them with their references, and keep the table up to date."""
 
 import os
 import shutil
@@ -36,7 +36,7 @@ PARTS = "parts"
 
 @dataclass
 class Bench:
-    """Runner of cases in a folder, which keeps the result files of references.
+    """Runner of cases in a folder that keeps the result files of references.
 
     study  : name of the study, a column of the table
     _locks : a lock for each reference, by its id
@@ -109,14 +109,14 @@ class Bench:
 
 
 def _figures(case: Case, path: Path, record: dict[str, Any]) -> tuple[Row, str]:
-    """Return the metrics of a run, and the reason if some are missing."""
+    """Return the metrics of a run, and the reason if any are missing."""
     row = costs(record)
     try:
         row |= frame_metrics(path, case.time_step)
     except (OSError, ValueError, InputError) as error:
         return row, f"no figures: {error}"
     if case.integrator == "verlet":
-        # verlet solves no system, so there is no estimate
+        # verlet solves no system, so there is no error to estimate
         row["estimated_error"] = None
     return row, ""
 
@@ -152,7 +152,7 @@ def run_study(
     full    : include sweeps, scenes and maps that are marked ``full``
     jobs    : number of cases at a time; the study file's if None
     restart : discard the rows and references of earlier runs
-    part    : (i, n): run and return only part i of n, counted from 1, in a folder of its own
+    part    : (i, n): run and return only part i of n, counted from 1, in its own folder
 
     ``folder`` gets table.csv, study.toml and references/. Rows of earlier runs and of parts are
     kept if their cases are still in the file. Raises InputError before the first run.
@@ -219,7 +219,7 @@ def _carry_out(
                 bar.write(f"case {count}/{bar.total}  {described(row)}", file=sys.stderr)
                 bar.update()
     finally:
-        # after an exception or an interrupt runs may be in progress
+        # after an exception or an interrupt, runs may still be in progress
         bench.processes.close()
         pool.shutdown(cancel_futures=True)
         # the folder is not empty if a failed case has left its log
@@ -238,9 +238,9 @@ def described(row: Row) -> str:
 
 
 def _continued(folders: Sequence[Path], by_id: dict[str, Case]) -> dict[str, Row]:
-    """Return the rows of these cases from earlier runs, with their present labels.
+    """Return the rows of these cases from earlier runs, with the labels of the study file.
 
-    If several folders have a row of a case, the first row that is done is taken.
+    If several folders have a row of a case, the first row of a finished case counts.
     """
     known: dict[str, Row] = {}
     for folder in dict.fromkeys(folders):
@@ -263,7 +263,7 @@ def _earlier_rows(folder: Path) -> list[Row]:
 
 
 def _is_done(case: Case, rows: dict[str, Row]) -> bool:
-    """Return whether a case has a valid row; a timeout is valid only under the same time limit."""
+    """Return whether a case is done: it has a row, which is no timeout under another time limit."""
     row = rows.get(case.id)
     return row is not None and not (
         row["status"] == "timeout" and row["reason"] != too_long(case.timeout)

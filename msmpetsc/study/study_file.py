@@ -1,7 +1,8 @@
 """The schema of a study file (TOML): its scenes, sweeps, methods and maps.
 
-Paths are relative to the study file; times are in seconds. In every table ``set`` holds overrides
-of scenes, ``error`` is a target of the relative step error, and ``full`` means only with --full.
+Paths are relative to the study file; times are in seconds. In every table, ``set`` holds overrides
+of scenes, and ``error`` is the target of the relative step error. With ``full`` a table counts only
+if --full is given.
 """
 
 import shlex
@@ -67,13 +68,13 @@ Options = Annotated[str, AfterValidator(_solver_options)]
 class ReferenceRun(Table):
     """The reference run of a scene, whose short steps stand for the true motion.
 
-    With its own ``cells``, many more than the cases have, the run stands for the continuous body,
-    and surfaces are compared.
+    With its own ``cells``, many more than the cases have, it stands for the continuous body, and
+    surfaces are compared.
 
-    step    : time step [s] of implicit integrators
-    substep : upper limit [s] of verlet's substeps; the stability limit if absent
-    cells   : the case's own lattice if absent
-    law     : material law; the case's own if absent
+    step    : time step of implicit integrators [s]
+    substep : upper limit of verlet's substeps [s]; the stability limit if absent
+    cells   : number of cells; the case's lattice if absent
+    law     : material law; the case's law if absent
     """
 
     integrator: IntegratorName = "verlet"
@@ -128,11 +129,11 @@ class Sweep(Table):
     """The product of lists of options for every scene; an empty list means the scene's value.
 
     scenes         : names of scenes; all scenes if empty
-    options        : PETSc options, each set a string: "-pc_type icc"
+    options        : sets of PETSc options, each a string: "-pc_type icc"
     laws           : material laws of cases and references; labels of curves name them
     time_steps     : [s]; for verlet the time between frames
-    substeps       : upper limits [s] of verlet's substeps; the stability limit if empty
-    max_iterations : iteration budgets, run in addition to ``errors``
+    substeps       : upper limits of verlet's substeps [s]; the stability limit if empty
+    max_iterations : iteration budgets, each a further case beside ``errors``
     steps          : number of steps in place of the scene's
     label          : label of curves in place of preset and options
     """
@@ -163,7 +164,7 @@ class Sweep(Table):
 class Method(Table):
     """An integrator with its solver settings, run at every point of the maps.
 
-    Verlet does not use the preset. Without an ``error`` the preset's holds.
+    Verlet does not use the preset. If ``error`` is absent, the preset's error is the target.
     """
 
     label: Name

@@ -1,6 +1,6 @@
 """The table of a study: a row for each case, stored as CSV and read as a pandas DataFrame.
 
-Functions import pandas themselves, because commands without a table should not wait for it.
+The functions import pandas themselves, so that commands without a table need not wait for it.
 """
 
 import math
@@ -15,7 +15,7 @@ from msmpetsc.results.disk import write_whole
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-# a case by column; None for a value that was not measured
+# values of a case by column; None for a value that was not measured
 Row = dict[str, Any]
 # scripts/docs/pages/reference/study-table.md gives units and meanings
 COLUMNS = (
@@ -86,7 +86,7 @@ def records(table: "DataFrame") -> list[Row]:
 
 
 def _number(value: Any) -> float:
-    """Return a finite number, of text as Python reads it, or NaN."""
+    """Return a value, or a text as Python reads it, as a finite number; otherwise NaN."""
     try:
         number = float(value)
     except (TypeError, ValueError):
@@ -105,7 +105,7 @@ def failed(table: "DataFrame") -> "DataFrame":
 
 
 def swept(table: "DataFrame") -> "DataFrame":
-    """Return the rows of sweeps; in a row of a map, failure is a result."""
+    """Return the rows of sweeps, without maps, in which a failure is a result."""
     return table[table["map"] == ""]
 
 

@@ -14,20 +14,23 @@ from msmpetsc.view.colours import ARROW, CLASSES, FIXED, GLASS, GLASS_EDGE, INK,
 from msmpetsc.view.composition import Composition, Still
 from msmpetsc.view.mesh import KINDS
 
-# height of a caption, and size and middle of each of its lines [px]
+# height of a caption; type size and middle of each of its lines [px]
 CAPTION, LINES = 68, ((21, 22), (16, 50))
 
 
 @cache
 def typeface(size: int) -> ImageFont.FreeTypeFont:
-    """Return the font DejaVu Sans, which matplotlib contains, in a size [px]."""
+    """Return the font DejaVu Sans, which comes with matplotlib, in a size [px]."""
     return ImageFont.truetype(
         str(Path(matplotlib.get_data_path(), "fonts", "ttf", "DejaVuSans.ttf")), size
     )
 
 
 def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) -> Array:
-    """Return the picture (height, width, 3) of two centred lines; ``letters`` scales the type."""
+    """Return the picture (height, width, 3) of two centred lines.
+
+    letters : scale of the type, 1 in a contact sheet
+    """
     picture = Image.new("RGB", (width, round(letters * CAPTION)), "white")
     for text, (size, middle) in zip(caption, LINES, strict=True):
         at = width / 2, letters * middle
@@ -39,9 +42,9 @@ def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) 
 LINE, GAP, TYPE_SIZE = 34, 36, 15
 # width of the symbol in front of an entry's text [px]
 WIDTHS = {"bar": 220, "swatch": 22, "glass": 22, "arrow": 30}
-# first and last row of a bar and of a tick, middle and size of a tick's number [px]
+# first and last row of a bar and of a tick; middle and type size of its number [px]
 BAR, TICK, NUMBER = (5, 17), (14, 20), (27, 12)
-# factor by which a legend is drawn larger and then reduced, for smooth edges
+# factor by which a legend is drawn larger before it is reduced [-]; for smooth edges
 SUPERSAMPLING = 3
 
 
@@ -113,7 +116,7 @@ def legend_picture(entries: Sequence[Entry], width: int, letters: float = 1.0) -
 
 
 def _reduced(picture: Image.Image, width: int) -> Image.Image:
-    """Return a picture that is at most this wide [px]."""
+    """Return a picture reduced to at most a width [px]."""
     if picture.width <= width:
         return picture
     return picture.resize(

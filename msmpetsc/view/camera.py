@@ -1,4 +1,4 @@
-"""The orthographic camera of a picture, under which lengths compare across the picture."""
+"""The orthographic camera of a picture: equal lengths look equal everywhere in the picture."""
 
 import math
 from collections.abc import Sequence

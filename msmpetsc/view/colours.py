@@ -34,11 +34,12 @@ CLASS_TABLE: Array = np.rint(255 * np.resize(to_rgba_array(CLASSES)[:, :3], (256
 
 # ---- fields on the surface
 
-# share of the area below the value that determines the scale; so that few points do not
+# share of the area whose values lie below the value that sets the scale [-]; a few
+# extreme points then do not stretch the scale
 QUANTILE = 0.99
-# largest ratio of the scale's end to that value
+# largest ratio of the scale's upper end to that value [-]
 HEADROOM = 1.25
-# ratio to a field's natural size below which the field is rounding error
+# ratio to a field's natural size below which the field is rounding [-]
 ROUNDING = 1e-12
 PREFIXES = {1e9: "G", 1e6: "M", 1e3: "k", 1.0: "", 1e-3: "m", 1e-6: "µ", 1e-9: "n"}
 
@@ -52,7 +53,7 @@ class Colouring:
     values  : function from a frame's number to the values (v,)
     high    : upper end of the scale, which begins at 0
     classes : name of each class number; the legend omits a class named ""
-    most    : greatest value, 0 if unknown; above ``high`` if the scale is clipped
+    most    : greatest value, 0 if unknown; above ``high`` if values are clipped
     natural : size of the field if a body moves by its own length; 0 if unknown
     """
 
@@ -84,7 +85,7 @@ class Colouring:
 
     @property
     def ticks(self) -> tuple[tuple[float, str], ...]:
-        """Position on the scale in [0, 1] and number of each tick, in the label's unit."""
+        """Position on the scale in [0, 1] and number of each tick, in the unit of the label."""
         if self.high == 0:
             return ((0.0, "0"),)
         high = self.high / self._size
@@ -200,7 +201,7 @@ COLOURINGS: dict[str, Callable[[Drawable], Colouring]] = {
 
 
 def scaled(colouring: Colouring, subject: Drawable, frames: Iterable[int]) -> Colouring:
-    """Return a field with a scale for these frames that a few extreme points do not stretch."""
+    """Return a field with its scale for some frames; a few extreme points do not stretch it."""
     weight = point_areas(subject.rest.points, subject.triangles)
     high = most = 0.0
     for index in frames:

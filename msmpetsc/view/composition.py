@@ -37,7 +37,13 @@ class Style:
 
 @dataclass(frozen=True)
 class Still:
-    """A picture to draw: frame number, obstacles and forces, two lines of caption, cells."""
+    """A picture to draw of a frame.
+
+    index    : number of the frame
+    overlays : obstacles and force arrows
+    caption  : two lines of text
+    cut      : cells to show; None for the whole surface
+    """
 
     index: int
     overlays: Overlays
@@ -47,7 +53,7 @@ class Still:
 
 @dataclass(frozen=True)
 class Composition:
-    """The frames of a subject to be drawn, with their common camera, colours and extent.
+    """The common camera, colours and extent of the frames of a subject that are drawn.
 
     extremes  : outermost points (e, 3) of all frames, in a set of directions [m]
     colouring : field with its scale
@@ -65,7 +71,7 @@ class Composition:
         return np.array([self.extremes.min(axis=0), self.extremes.max(axis=0)])
 
     def stills(self, frames: Sequence[int], words: str = "") -> list[Still]:
-        """Return the still of each frame, with its time and ``words`` as caption."""
+        """Return the still of each frame, with a caption of its time and ``words``."""
         cut = cut_open(self.subject, self.camera) if self.style.cells else None
         stills = []
         for index in frames:
@@ -74,10 +80,10 @@ class Composition:
         return stills
 
     def room(self, stills: Sequence[Still]) -> tuple[Floats, Floats, float]:
-        """Return the corners (2,), (2,) of the picture that contains all stills, and its depth [m].
+        """Return the corners (2,), (2,) of the view that contains all stills, and its depth [m].
 
-        The corners are lower left and upper right in the picture's plane, margin included. Grounds
-        count only as far as the bodies' shadows reach.
+        The corners are lower left and upper right in the picture's plane, with the margin. A ground
+        counts only as far as the shadows of the bodies reach.
         """
         sides = np.ptp(self.camera.flat(self.extremes), axis=0)
         margin = np.maximum(MARGIN * sides, LEAST_MARGIN * sides.max())
@@ -96,7 +102,10 @@ class Composition:
 
 
 def composition_of(subject: Drawable, frames: Sequence[int], style: Style) -> Composition:
-    """Return the composition of frames, which are read in turn. Raises InputError."""
+    """Read frames one after another and return their composition.
+
+    Raises InputError if they cannot be drawn.
+    """
     colouring = colouring_of(subject, style.colour)
     # the outermost points in these directions represent the extent
     directions = np.concatenate([np.eye(3), -np.eye(3), pv.Icosphere(nsub=1).points]).T

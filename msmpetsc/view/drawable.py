@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from msmpetsc.build import Model
     from msmpetsc.scene.reading import Scene
 
-# largest coordinate [m]; VTK squares coordinates in single precision
+# largest coordinate that can be drawn [m]; VTK squares coordinates in single precision
 FARTHEST = 1e15
 
 
@@ -48,11 +48,11 @@ class BodiesAtRest:
         return np.array([(points.min(axis=0), points.max(axis=0)) for points in of_bodies])
 
     def find(self, table: OfBody) -> Mask:
-        """Return which nodes (n,) lie in a table's region; none if the result lacks the region."""
+        """Return the mask (n,) of nodes in a table's region; empty if the result lacks it."""
         region = table.table.region
         if region.is_of_mesh:
             return np.isin(np.arange(len(self.nodes)), self.cells[self._painted_cells(table)])
-        # nodes outside the surface count with the nearest point of the body's box
+        # the nearest point of the body's box stands for a node outside the box
         low, high = np.moveaxis(self.bounds[self.body_of_node], 1, 0)
         return inside_bodies(
             region, np.clip(self.nodes, low, high), self.bounds, self.body_of_node, table.body
@@ -64,7 +64,7 @@ class BodiesAtRest:
         return np.asarray(self.nodes[self.cells].mean(axis=1))
 
     def points_in(self, table: OfBody) -> Mask:
-        """Return which points (v,) lie in a table's region; none if the result lacks the region."""
+        """Return the mask (v,) of points in a table's region; empty if the result lacks it."""
         region = table.table.region
         if region.is_of_mesh:
             around = self.cells_around(self.points, self.body_of_point)
@@ -75,7 +75,7 @@ class BodiesAtRest:
         """Return the numbers of the cells that contain the painted points of a table's region."""
         painted = table.table.region.painted
         number = table.body or 0
-        # a result does not contain a region that is a file or a group
+        # a result does not contain the points of a file or the triangles of a group
         if not isinstance(painted, tuple):
             return np.empty(0, int)
         points = self.points[self.body_of_point == number][list(painted)]
@@ -88,7 +88,7 @@ class BodiesAtRest:
         for number in np.unique(body):
             own = np.flatnonzero(of_cell == number)
             inside = body == number
-            # cells are cubes: the nearest centre is nearest in the max norm
+            # cells are cubes, so a point's cell has the nearest centre in the max norm
             around[inside] = own[KDTree(self.middles[own]).query(points[inside], p=np.inf)[1]]
         return around
 
@@ -101,11 +101,11 @@ class Drawable:
     pinned    : which nodes (n,) are pinned
     triangles : (f, 3) surface points of each triangle
     times     : times of the frames (T,) [s]
-    nodes     : function from a frame's number to node positions (n, 3) [m]
+    nodes     : function from the number of a frame to node positions (n, 3) [m]
     embedding : W (v, n): surface points = W @ node positions
-    array     : function from the name of a result's dataset to its values
+    array     : function from the name of a dataset of the result to its values
     solids    : surfaces at time 0 of obstacles that have a mesh, by obstacle number
-    von_mises : function from a frame's number to nodal stress (n,) [Pa]; None if not stored
+    von_mises : function from the number of a frame to nodal stress (n,) [Pa]; None if not stored
     frequencies : (T - 1,) [Hz] of the modes that frames after the first show; empty for a run
     """
 
@@ -138,7 +138,7 @@ class Drawable:
         return np.asarray(self.embedding @ self.nodes(index))
 
     def fixed(self, index: int) -> Floats:
-        """Return how far each surface point is pinned or anchored at a frame, (v,) in [0, 1]."""
+        """Return the share (v,) in [0, 1] of pinned or anchored nodes in each surface point."""
         fixed = self.pinned.copy()
         for anchor in self.scene.tables("anchor"):
             if within(float(self.times[index]), 0.0, anchor.table.stop):

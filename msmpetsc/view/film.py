@@ -21,10 +21,10 @@ from msmpetsc.view.drawable import Drawable
 from msmpetsc.view.mesh import drawn
 from msmpetsc.view.renderer import Renderer
 
-# default longer side of the view, and least sides that keep captions legible [px]
+# default longer side of the view, and least width and height for legible captions [px]
 LONGEST = 960
 SHORTEST = np.array([240, 96])
-# sides from which on type has full size [px], and smallest scale of type
+# least width and height for type of full size [px], and smallest scale of type [-]
 FULL_TYPE_SIDES = np.array([480, 720])
 SMALLEST_TYPE = 0.5
 # highest frame rate [1/s]
@@ -32,7 +32,7 @@ MAX_FPS = 30.0
 # range of a film's default length, and greatest length [s]
 LENGTHS = (3.0, 8.0)
 LONGEST_FILM = 3600.0
-# factors times powers of ten of the default speed
+# a default speed is one of these factors times a power of ten
 STEPS = (1, 2, 5)
 
 
@@ -40,7 +40,7 @@ STEPS = (1, 2, 5)
 class Playback:
     """The frames and the speed of a film.
 
-    numbers : position in the list of frames of each picture's frame
+    numbers : for each picture, the position of its frame in the list of frames
     fps     : pictures per second
     speed   : simulated seconds per second
     """
@@ -60,7 +60,7 @@ class Playback:
 
 
 def usual_speed(span: float) -> float:
-    """Return the round speed [simulated s/s] at which a time span [s] lasts 3 to 8 s."""
+    """Return a round speed [simulated s/s] at which a film of a time span [s] lasts 3 to 8 s."""
     if not 0 < span < np.inf:
         return 1.0
     factors = np.outer(10.0 ** np.arange(20), STEPS).ravel()
@@ -71,14 +71,15 @@ def usual_speed(span: float) -> float:
 
 
 def playback_of(times: Floats, speed: float | None = None) -> Playback:
-    """Return which frame each picture shows, and the speed of the film.
+    """Return which frame each picture of a film shows, and the speed of the film.
 
-    Pictures are at equal intervals and show the nearest frame.
+    Pictures follow at equal intervals; each shows the nearest frame.
 
-    times : (k,) of the frames [s]
-    speed : simulated seconds per second; None for a round speed by which the film lasts 3 to 8 s
+    times : times of the frames (k,) [s]
+    speed : simulated seconds per second; None for a round speed at which the film lasts 3 to 8 s
 
-    Raises InputError for frames out of order, and for a film of over an hour.
+    Raises InputError if there are fewer than two frames, frames are out of order, or the film would
+    last over an hour.
     """
     steps = np.diff(times)
     if not (len(steps) and (steps > 0).all()):
@@ -107,7 +108,7 @@ def write_film(
 
 
 def _default_size(composition: Composition, stills: list[Still]) -> tuple[int, int]:
-    """Return the even width and height [px] for the view, the caption and the legend."""
+    """Return an even width and height [px] of a film: of view, caption and legend together."""
     low, high, _ = composition.room(stills)
     width, height = np.maximum((high - low) * LONGEST / (high - low).max(), SHORTEST)
     letters = _type_scale(width, height)

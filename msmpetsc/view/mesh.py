@@ -1,8 +1,8 @@
 """Meshes to be drawn: the refined surface, and the cells of the rear half of the lattice.
 
-Surface triangles larger than a cell are refined to follow the cells that carry them, and points on
-sharp edges are duplicated. The drawn points are the file's points in their order, then points on
-divided edges, then duplicates.
+Surface triangles larger than a cell are refined, so that they follow the cells that carry them.
+Points on sharp edges are duplicated. The drawn points are the file's points in their order, then
+points on divided edges, then duplicates.
 """
 
 from dataclasses import replace
@@ -21,7 +21,7 @@ from msmpetsc.view.drawable import BodiesAtRest, Drawable
 
 # angle between normals above which an edge is sharp [degrees]
 SHARP = 30.0
-# fixed share of a surface point above which it has the colour of fixed parts
+# share of fixed nodes from which a surface point has the colour of fixed parts [-]
 FIXED_SHARE = 0.5
 # approximate limit of triangles after refinement
 MAX_TRIANGLES = 30_000
@@ -30,12 +30,15 @@ CORNERS = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1
 
 
 def drawn(subject: Drawable) -> Drawable:
-    """Return bodies with their surface refined, and split at sharp edges."""
+    """Return bodies with their surface refined and split at sharp edges."""
     return _split(_refined(subject))
 
 
 def _refined(subject: Drawable) -> Drawable:
-    """Return bodies whose surface has no edge longer than a cell; cells carry the new points."""
+    """Return bodies with surface edges no longer than a cell, up to about MAX_TRIANGLES triangles.
+
+    The cells carry the new points.
+    """
     rest = subject.rest
     cell = float(np.ptp(rest.nodes[rest.cells[0]], axis=0).max())
     if cell == 0:
@@ -46,7 +49,7 @@ def _refined(subject: Drawable) -> Drawable:
     body = np.append(rest.body_of_point, np.empty(len(points) - len(rest.points), int))
     given = subject.triangles[part_of]
     body[triangles] = body[given[:, :1]]
-    # a given triangle at each point
+    # the corners of a given triangle at each point
     around = np.zeros((len(points), 3), int)
     around[triangles] = given[:, None]
     new = slice(len(rest.points), None)
@@ -88,7 +91,7 @@ def trilinear(
     """Return the matrix (p, n) of trilinear weights of nodes at points (p, 3) of bodies (p,).
 
     carried : surface points (p, k) next to each point, and the embedding of the surface points; of
-              several copies of a cell, the copy counts that shares the most nodes with theirs
+              the copies of a cell, the copy that shares most nodes with these points is used
     """
     cells = rest.cells_around(points, body)
     if carried is not None:
@@ -105,7 +108,7 @@ def trilinear(
 def _choose_copies(
     rest: BodiesAtRest, cells: Indices, neighbours: Indices, embedding: csr_array
 ) -> None:
-    """Replace cells (p,) by the copies at their places that carry ``neighbours`` (p, k)."""
+    """Replace each of ``cells`` (p,) by the copy of it that carries ``neighbours`` (p, k)."""
     order = np.lexsort(rest.middles.T)
     is_copy = (np.diff(rest.middles[order], axis=0) == 0).all(axis=1)
     place = np.empty(len(order), int)
@@ -118,7 +121,7 @@ def _choose_copies(
 
 
 def _split(subject: Drawable) -> Drawable:
-    """Return bodies whose surface points are duplicated for each smooth patch around them."""
+    """Return bodies with a surface point for each smooth patch around the point."""
     rest = subject.rest
     first = first_of_equal(np.column_stack([rest.body_of_point, rest.points]))
     origin, triangles = split_at_edges(rest.points, first[subject.triangles])
@@ -129,8 +132,8 @@ def _split(subject: Drawable) -> Drawable:
 def split_at_edges(points: Positions, triangles: Indices) -> tuple[Indices, Indices]:
     """Return the original point (d,) of each drawn point, and triangles (f, 3) of drawn points.
 
-    The first v drawn points are the originals. A point has a duplicate for each further smooth
-    patch that sharp edges separate around it.
+    The first v drawn points are the originals. Sharp edges separate smooth patches around a point;
+    it has a duplicate for each patch after the first.
     """
     surface = surface_of(points, triangles)
     options: dict[str, Any] = dict(
@@ -142,7 +145,7 @@ def split_at_edges(points: Positions, triangles: Indices) -> tuple[Indices, Indi
 
 # values of lattice/cell_kind
 BOUNDARY, INTERIOR = 1, 2
-# scale of a drawn cell, which separates it from its neighbours
+# size of a drawn cell over its true size [-]; leaves gaps between cells
 CELL_SCALE = 0.86
 # opacity of a body whose cells are shown
 CUT_OPACITY = 0.3

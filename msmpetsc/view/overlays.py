@@ -14,7 +14,7 @@ from msmpetsc.view.drawable import Drawable
 # length of an arrow, relative to the longest side of the largest body
 ARROW = 0.2
 # The following lengths are relative to the longest side of the box around all bodies.
-# largest distance of an obstacle that is shown
+# largest distance from the bodies of an obstacle that is shown
 NEAR = 0.5
 # largest side of a shown box, relative to the same side of the box around the bodies
 CUT = 1.3
@@ -40,7 +40,7 @@ class Ground:
 
 @dataclass(frozen=True)
 class Ball:
-    """A sphere: center (3,), radius [m], corners (8, 3) of the visible part of its box."""
+    """A sphere: center (3,), radius [m], and corners (8, 3) of the visible part of its box."""
 
     center: Floats
     radius: float
@@ -69,7 +69,8 @@ class Overlays:
     """Obstacles and force arrows of a picture.
 
     grounds : planes that do not hide the bodies
-    glass   : corners (8, 3) of boxes and of planes in front; corner (i, j, k) is 4i + 2j + k
+    glass   : corners (8, 3) of boxes, and of planes that would hide the bodies; corner (i, j, k) is
+              number 4i + 2j + k
     arrows  : tail and tip (2, 3) of each arrow
     balls   : spheres, drawn as glass
     meshes  : obstacles that are meshes or functions
@@ -91,7 +92,7 @@ class Overlays:
 def overlays_at(subject: Drawable, index: int, bodies: Positions, camera: Camera) -> Overlays:
     """Return the obstacles and force arrows of a frame.
 
-    bodies : surface points (b, 3) of all pictures [m]; obstacles are clipped to their surroundings
+    bodies : surface points (b, 3) of all pictures [m]; obstacles are clipped near these points
     """
     time = float(subject.times[index])
     solids = subject.solids
@@ -179,7 +180,7 @@ def _arrows(subject: Drawable, index: int) -> list[Positions]:
     arrows = []
     for table in subject.scene.tables("force"):
         force = table.table
-        # a force given by a function has no single direction, so no arrow
+        # a force given by a function has no single direction, and so no arrow
         total = total_of(force.total or (0.0, 0.0, 0.0)).value_at(time)
         if (
             within(time, force.start, force.stop)

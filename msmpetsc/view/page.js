@@ -1,5 +1,5 @@
 "use strict";
-// The page of a result, its frames unpacked. The other files page_*.js are of the same script.
+// The data of a page and its unpacked frames. page_drawing.js and page_steering.js continue this script.
 
 const data = JSON.parse(document.getElementById("data").textContent);
 const byId = (id) => document.getElementById(id);
@@ -28,7 +28,8 @@ async function inflated(name) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-function summed(values, length) { // the frames of a length, from their differences
+// Return frames of a length from their differences, in place.
+function summed(values, length) {
   for (let k = length; k < values.length; k++) values[k] += values[k - length];
   return values;
 }

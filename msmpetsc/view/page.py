@@ -1,8 +1,8 @@
-"""A web page of a result in a single file: the mouse turns the body, a slider plays its frames.
+"""A web page of a result in a single file: the mouse turns the body, a slider plays the frames.
 
 page.html, page.css and page*.js contain layout and drawing; this module supplies the data.
-Positions are 16-bit integers over the box around all frames. A frame is stored as its difference
-from the previous frame, deflated and base64-encoded.
+Positions are 16-bit integers over the box around all frames. Each frame is stored as its difference
+from the frame before, deflated and base64-encoded.
 """
 
 import base64
@@ -29,7 +29,7 @@ from msmpetsc.view.drawable import Drawable
 from msmpetsc.view.film import usual_speed
 from msmpetsc.view.mesh import drawn
 
-# size of frames before they are packed [byte], above which some are left out
+# largest size of all frames before packing [byte]; frames beyond it are left out
 MAX_BYTES = 30_000_000
 # largest 16-bit integer
 LEVELS = 65535
@@ -73,7 +73,7 @@ def packed_frames(composition: Composition, frames: Sequence[int]) -> dict[str, 
 
 
 def deflated(frames: Iterable[Array]) -> bytes:
-    """Return the deflated differences of frames from the previous, in numbers that wrap."""
+    """Return frames as deflated differences from the frame before; the integers wrap around."""
     packer = zlib.compressobj()
     parts = []
     before: Any = 0
@@ -102,7 +102,7 @@ def page_facts(composition: Composition, stills: Sequence[Still]) -> dict[str, A
 
 
 def solid_facts(surface: Surface) -> dict[str, Floats]:
-    """Return an obstacle's surface for the script: corners and normals of each triangle."""
+    """Return an obstacle's surface for the script: corners and their normals of each triangle."""
     corners = surface.points[surface.triangles]
     normals = igl.per_face_normals(surface.points, surface.triangles, np.zeros(3))
     largest = np.abs(corners).max(initial=np.finfo(float).tiny)

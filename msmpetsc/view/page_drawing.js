@@ -2,7 +2,7 @@
 
 const LIGHT = `
 float light(vec3 n) {
-  n.z = abs(n.z); // what is seen faces the eye, though normals between points may not
+  n.z = abs(n.z); // visible surfaces face the eye, but interpolated normals may not
   return 0.42 + 0.62 * (0.85 * max(0.0, dot(n, normalize(vec3(-0.5, 1.1, 1.3))))
     + 0.35 * max(0.0, dot(n, normalize(vec3(1.0, 0.15, 0.65)))));
 }`;
@@ -20,7 +20,7 @@ precision mediump float;
 in vec3 facing; in vec3 paint; in float held; uniform vec3 fixedColour; out vec4 pixel;
 ${LIGHT}
 void main() {
-  vec3 colour = held > 0.5 ? fixedColour : paint; // as renderer.py clips
+  vec3 colour = held > 0.5 ? fixedColour : paint; // FIXED_SHARE of mesh.py
   pixel = vec4(colour * light(normalize(facing)), 1.0);
 }`];
 const FLAT = [`#version 300 es
@@ -81,7 +81,9 @@ function start() {
   filled("triangles", triangles, gl.ELEMENT_ARRAY_BUFFER);
 }
 
-function normals(at) { // of the points, from the triangles around each, weighed by their areas
+// Return outward normals at the points, summed over the triangles around each and weighted by area.
+// They are not unit vectors: the largest component of all is 1.
+function normals(at) {
   const sums = new Float32Array(3 * points), [sx, sy, sz] = size;
   for (let k = 0; k < triangles.length; k += 3) {
     const a = 3 * triangles[k], b = 3 * triangles[k + 1], c = 3 * triangles[k + 2];
@@ -93,7 +95,8 @@ function normals(at) { // of the points, from the triangles around each, weighed
   let most = 0, volume = 0;
   for (let k = 0; k < sums.length; k++) volume += size[k % 3] * (at[k] - 32767) * sums[k];
   for (const x of sums) most = Math.max(most, Math.abs(x));
-  for (let k = 0; k < sums.length; k++) sums[k] /= (volume < 0 ? -most : most) || 1; // outwards, and of squares that are numbers
+  // outwards, and scaled so that squares do not overflow
+  for (let k = 0; k < sums.length; k++) sums[k] /= (volume < 0 ? -most : most) || 1;
   return sums;
 }
 
@@ -116,14 +119,16 @@ function axesOfEye() {
   return { across, upward: sum(scaled(up, Math.cos(pitch)), ahead, Math.sin(pitch)), toEye };
 }
 
-function firstExtent() { // twice how far all that is ever drawn reaches from the middle, across and upward
+// Return twice the largest distances, across and upward, of all drawn points from the middle.
+function firstExtent() {
   const beside = data.overlays.flatMap(({ grounds, glass, balls, meshes }) => [
     ...grounds.map((ground) => CORNERS.map((corner) => below(ground, corner))), ...glass, ...[...balls, ...meshes].map((round) => round.seen)]);
   const { across, upward } = axesOfEye(), every = [...CORNERS, ...beside.flat()];
   return [across, upward].map((axis) => 2 * Math.max(...every.map((point) => Math.abs(dot(axis, sum(point, middle, -1))))));
 }
 
-function perMetre() { // pixels of the page; turning does not change it
+// Return the page's pixels per metre; turning the body does not change the scale.
+function perMetre() {
   const [wide, high] = extent;
   return view.zoom * Math.min(canvas.clientWidth / (1.12 * wide), canvas.clientHeight / (1.12 * high));
 }
@@ -161,18 +166,21 @@ function bodyElements() {
 
 const below = ({ corners, normal }, point) => sum(point, normal, dot(normal, sum(corners[0], point, -1)));
 
-const RINGS = 16, SOLID = 0.55; // of a ground, that fades from a share of its radius on to its rim
+// number of rings of a ground; share of its radius from which it fades
+const RINGS = 16, SOLID = 0.55;
 
-function drawGround(camera, ground, eye) { // a disk within its corners, ring over ring
+// Draw a ground as a disk of rings within its corners, and the body's shadow.
+function drawGround(camera, ground, eye) {
   const night = dark.matches, [a, b, , d] = ground.corners, seenFromAbove = dot(ground.normal, eye.toEye) > 0;
   const halves = [b, d].map((corner) => scaled(sum(corner, a, -1), 0.5)), centre = sum(sum(a, halves[0]), halves[1]);
   const ring = (r) => TURNS.map((turn) => sum(sum(centre, halves[0], r * Math.cos(turn)), halves[1], r * Math.sin(turn)));
-  if (!seenFromAbove) { // it would hide the body
+  // from below, a disk would hide the body
+  if (!seenFromAbove) {
     drawFlat(camera, ring(SOLID), gl.LINE_LOOP, [...colour(night ? "#59616b" : "#b9b3a6"), 1]);
     return;
   }
   const paint = colour(night ? "#2b3037" : "#efece6");
-  gl.disable(gl.DEPTH_TEST); // it is drawn first, and all in one plane
+  gl.disable(gl.DEPTH_TEST); // the ground is drawn first, and all rings lie in one plane
   gl.enable(gl.BLEND);
   for (let k = 0; k < RINGS; k++) drawFlat(camera, ring(1 - (1 - SOLID) * k / RINGS), gl.TRIANGLE_FAN, [...paint, 3 / RINGS]);
   gl.disable(gl.BLEND);
@@ -213,7 +221,8 @@ function drawGlass(camera, corners) {
 
 const TURNS = Array.from({ length: 72 }, (_, n) => 2 * Math.PI * n / 72);
 
-function drawBall(camera, { center, radius }, eye) { // without perspective a sphere is a disk that faces the eye
+// Draw a sphere: without perspective it is a disk that faces the eye.
+function drawBall(camera, { center, radius }, eye) {
   const rim = TURNS.map((turn) => sum(sum(center, eye.across, radius * Math.cos(turn)), eye.upward, radius * Math.sin(turn)));
   gl.enable(gl.BLEND);
   gl.depthMask(false);
@@ -223,11 +232,13 @@ function drawBall(camera, { center, radius }, eye) { // without perspective a sp
   drawFlat(camera, rim, gl.LINE_LOOP, [...colour("#667e90"), 1]);
 }
 
-function turned(vectors, turn) { // in threes: each is x @ turn of x
+// Return x @ turn for each vector x, three numbers each.
+function turned(vectors, turn) {
   return Float32Array.from(vectors, (_, k) => [0, 1, 2].reduce((total, row) => total + vectors[k - k % 3 + row] * turn[row][k % 3], 0));
 }
 
-function drawMesh(camera, eye, { number, turn, by }) { // a mesh, in the colour of obstacles
+// Draw the mesh of an obstacle.
+function drawMesh(camera, eye, { number, turn, by }) {
   const { corners, normals } = data.solids[number];
   use(lit, camera, by, [1, 1, 1]);
   gl.uniformMatrix3fv(lit.uniforms.turning, false, turningOf(eye));
@@ -241,7 +252,8 @@ function drawMesh(camera, eye, { number, turn, by }) { // a mesh, in the colour 
   gl.drawArrays(gl.TRIANGLES, 0, corners.length / 3);
 }
 
-function drawArrow(camera, [tail, tip], eye) { // flat, as wide seen from every side
+// Draw an arrow, flat and turned towards the eye.
+function drawArrow(camera, [tail, tip], eye) {
   const along = sum(tip, tail, -1), aside = scaled(unit(cross(along, eye.toEye)), Math.hypot(...along));
   const at = (far, wide) => sum(sum(tail, along, far), aside, wide);
   const shaft = [at(0, 0.045), at(0, -0.045), at(0.66, -0.045), at(0.66, 0.045)];
@@ -266,7 +278,7 @@ function draw() {
   drawBody(matrix, eye);
   for (const corners of state.glass) drawGlass(matrix, corners);
   for (const ball of state.balls) drawBall(matrix, ball, eye);
-  gl.clear(gl.DEPTH_BUFFER_BIT); // arrows are in front of all
+  gl.clear(gl.DEPTH_BUFFER_BIT); // so that arrows are drawn in front
   for (const arrow of state.arrows) drawArrow(matrix, arrow, eye);
   showState();
 }

@@ -1,6 +1,6 @@
 // Around the picture: legend, player, time, mouse, fingers and keys.
 
-// What stands around the picture
+// Legend, player and time
 
 function showState() {
   const rate = +speedChoice.value;
@@ -55,7 +55,8 @@ function makePlayer() {
 
 // Time
 
-let begun = null; // when the play began [ms], and at which time of the result [s]
+// start of the playback: clock [ms] and time of the result [s]
+let begun = null;
 function tick(now) {
   if (!view.playing) return;
   begun ??= { now, time: view.frame === frames - 1 ? data.times[0] : data.times[view.frame] };
@@ -145,7 +146,7 @@ addEventListener("keydown", (event) => {
 addEventListener("resize", redraw);
 dark.addEventListener("change", redraw);
 
-// The start of the page, when all of it is known.
+// Start of the page, once all scripts are read
 
 let extent;
 async function begin() {

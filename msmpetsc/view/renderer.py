@@ -22,7 +22,7 @@ FADING, RIM_CORNERS = 0.55, 72
 
 
 class Renderer(AbstractContextManager["Renderer"]):
-    """An off-screen window that draws stills; a context manager, which closes the window."""
+    """An off-screen window that draws stills, and a context manager that closes the window."""
 
     def __init__(self, composition: Composition, stills: Sequence[Still], size: tuple[int, int]):
         """Open a window of width and height [px] whose view contains all stills."""
@@ -47,7 +47,7 @@ class Renderer(AbstractContextManager["Renderer"]):
     def picture(self, still: Still) -> Array:
         """Return the picture (height, width, 3) of a still. Raises InputError if it is black."""
         with quiet_opengl():
-            # otherwise each added mesh would render the window
+            # otherwise the window would be rendered for each added mesh
             self._plotter.suppress_rendering = True
             self._plotter.clear_actors()
             self._draw(still)
@@ -59,7 +59,7 @@ class Renderer(AbstractContextManager["Renderer"]):
         return np.asarray(picture)
 
     def _face(self, centre: Floats, height: float) -> None:
-        """Aim the camera at a point (2,) of the picture's plane; ``height`` is the view's [m]."""
+        """Aim the camera at a point (2,) of the picture's plane; ``height`` [m] is in view."""
         camera = self._composition.camera
         view = self._plotter.camera
         distance = 4 * self._depth
@@ -99,7 +99,7 @@ class Renderer(AbstractContextManager["Renderer"]):
             ).shrink(CELL_SCALE)
             self._plotter.add_mesh(grid, color=KINDS[kind][0], ambient=0.5, diffuse=0.55)
         self._draw_obstacles(still.overlays)
-        # an arrow moved towards the eye stays in place and is not hidden
+        # moved towards the eye, an arrow stays in place and nothing hides it
         towards_eye = 2 * self._depth * self._composition.camera.to_eye
         for tail, tip in still.overlays.arrows:
             _draw_arrow(self._plotter, tail + towards_eye, tip - tail)

@@ -1,4 +1,4 @@
-"""Contact sheets: rows of pictures of a result's moments, or of a scene before its first step.
+"""Contact sheets: rows of pictures of a result at some times, or of a scene before its first step.
 
 A common orthographic camera makes lengths comparable between the panels. Each panel shows the
 obstacles and forces at its own time.
@@ -21,11 +21,11 @@ from msmpetsc.view.drawable import Drawable, drawable_of_result
 from msmpetsc.view.mesh import drawn
 from msmpetsc.view.renderer import Renderer
 
-# largest sides of a panel, and least width for a caption [px]
+# largest width and height of a panel, and least width for a caption [px]
 PANEL, NARROWEST = np.array([400, 870]), 240
 # width of the sheet above which panels are broken into rows [px]
 ROW = 2000
-# default number of moments
+# default number of pictures
 COUNT = 5
 
 
@@ -36,10 +36,10 @@ def contact_sheet(
     count: int | None = None,
     style: Style | None = None,
 ) -> Path:
-    """Draw a result's surface at some moments as a PNG file; return ``png_path``.
+    """Draw a result's surface at some frames as a PNG file; return ``png_path``.
 
     frames : frame numbers; by default the frames at the scene's picture.times, if it has any
-    count  : number of moments that ``choose_moments`` selects, if ``frames`` is not given
+    count  : number of frames that ``choose_moments`` selects, if ``frames`` is not given
 
     Raises InputError if the result cannot be read or drawn.
     """
@@ -86,7 +86,7 @@ def draw_panels(composition: Composition, stills: Sequence[Still], path: str | P
 def _moments(
     run: Result, subject: Drawable, frames: Frames | None, count: int | None
 ) -> dict[int, str]:
-    """Return the chosen frames, each with its reason or ""."""
+    """Return the frames to draw, each with the reason for its choice or ""."""
     if frames:
         return dict.fromkeys(frames_of(subject.name, frames, len(subject.times)), "")
     if count is not None or not subject.scene.picture.times:

@@ -1,4 +1,4 @@
-"""``msmpetsc check``: compare the numbers of a scene with numbers that ``--update`` has stored.
+"""``msmpetsc check``: compare the numbers of scenes with numbers that ``--update`` has stored.
 
 ``results.baseline`` has the numbers and their tolerance.
 """

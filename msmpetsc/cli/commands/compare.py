@@ -1,4 +1,4 @@
-"""``msmpetsc compare``: print the differences of two results, with the first frame and node."""
+"""``msmpetsc compare``: print the differences of two results, and where they first differ."""
 
 import argparse
 import json
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def compared(first: Result, second: Result) -> tuple[Comparison, list[str]]:
-    """Return the comparison of two results, by surfaces only if lattices differ, and notes."""
+    """Return the comparison of two results, and notes; surfaces only if the lattices differ."""
     try:
         return compare(first, second), []
     except DifferentLattices as error:

@@ -1,6 +1,6 @@
 """``msmpetsc doctor``: check the installation and print a remedy for each missing package.
 
-Each probe runs in a process of its own, as incompatible libraries may end the process.
+Each probe runs in its own process, because an incompatible library may end the process.
 """
 
 import argparse
@@ -19,7 +19,7 @@ from msmpetsc.errors import EXTRAS
 OK, MISSING, BROKEN = "ok", "missing", "BROKEN"
 # time limit of a probe [s]; far above the time to load a library
 PATIENCE = 60
-# program of each probe, which prints its finding, or nothing
+# program of each probe; it prints its finding, or nothing
 PROBES = {
     "PETSc": """
 import numpy
@@ -59,7 +59,7 @@ NOTHING = {
         "NUMBA_CACHE_DIR to a writable folder",
     ),
 }
-# commands that install packages which pip alone does not install
+# command that installs a package, if ``pip install NAME`` does not
 BRINGS = {
     "petsc4py": "apt install python3-petsc4py, or with PETSC_DIR set: pip install 'msmpetsc[run]'",
     "mpi4py": "apt install python3-mpi4py openmpi-bin, or pip install 'msmpetsc[run]'",
@@ -98,7 +98,7 @@ def findings() -> Iterator[Finding]:
 
 
 def probed(code: str, *launcher: str) -> tuple[str, str]:
-    """Run a probe in a Python of its own; return its state, and its output or failure.
+    """Run a probe in its own Python process; return its state, and its output or failure.
 
     launcher : words before the Python command, for example "mpiexec", "-n", "2"
     """

@@ -1,10 +1,10 @@
 """``msmpetsc inspect``: print mesh groups, counts and memory of a scene without a run.
 
-The counts give ranks equal parts of cells and nodes along the Morton curve. The parts of a run,
-made by sampling (geometry.partition.SortedKeys), agree with these within an eighth.
+The counts assume that each rank has an equal part of the cells and nodes along the Morton curve.
+The parts of a run, made by sampling (geometry.partition.SortedKeys), differ by up to an eighth.
 
-The memory of a rank is the program plus the larger of two peaks: that of a step, which is
-proportional to the nodes, and that of the construction of W.
+The memory of a rank is the memory of the program plus the larger of two peaks: the peak of a step,
+which is proportional to the nodes, and the peak while W is built.
 """
 
 import argparse
@@ -41,10 +41,10 @@ MOST_BUILT = 200_000
 # largest number of ranks [-]; far above any machine
 MOST_RANKS = 10**6
 GB = 1e9
-# memory of a rank beside its nodes [byte]; this and the next three were measured in
-# runs of 3,000 to 350,000 nodes
+# memory of a rank without its nodes [byte]; this and the next three numbers were
+# measured in runs of 3,000 to 350,000 nodes
 PROGRAM = 0.3e9
-# memory of a node, ghosts included [byte]: of a solid, of springs, and with A
+# memory per node, ghosts included [byte]: for a solid, for springs, and if A is used
 OF_SOLID, OF_SPRINGS, WITH_A = 2400, 3200, 3900
 # peak memory for a surface point with 64 weights while W is made [byte]; measured with
 # the embedding "affine"
@@ -61,8 +61,8 @@ def partition_of(
 ) -> tuple[Partition, int, float]:
     """Return the partition among ``ranks`` ranks, the counted cells, and the scene's cell size [m].
 
-    If the scene has more than MOST_BUILT cells, a lattice of about MOST_BUILT cells is counted,
-    and its counts are scaled.
+    If the scene has more than MOST_BUILT cells, count a lattice of about MOST_BUILT cells and
+    scale the counts.
     """
     h = wanted.cell_size or estimated_size(bodies, wanted.count or 0)
     cells = float(wanted.count or estimated_cells(bodies, h))

@@ -1,7 +1,7 @@
 """``msmpetsc new``: write a first scene for a mesh, or copy a scene that comes with msmpetsc.
 
-The body falls on the ground. Lengths and times of the scene are multiples of the body's height and
-its root, so that bodies of all sizes move alike.
+The body falls on the ground. Lengths grow with the body's height, and times with its square root,
+so that bodies of all sizes move alike.
 """
 
 import argparse
@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
 def drafted(mesh: Path, scene: Path, up: str | None) -> str:
     """Return the text of a scene for a mesh file or a registry name. Raises InputError.
 
-    up : the mesh's upward axis, "y" or "z"; None for y in glTF files and z in others
+    up : the mesh's upward axis, "y" or "z"; None for y in glTF files and z in all other files
     """
     source = str(mesh) if str(mesh) in MODELS else path_from(scene, mesh)
     surface = load(source, scene.parent)

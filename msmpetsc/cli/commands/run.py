@@ -16,7 +16,7 @@ def run(args: argparse.Namespace) -> int:
     comm = MPI.COMM_WORLD
     request = RunRequest(**{name: value for name, value in vars(args).items() if name in OPTIONS})
     if not args.show_options:
-        # the signal must not kill a run that is being set up, or writes its last files
+        # the signal must not kill the run while it is set up or writes its last files
         before = signal.signal(signal.SIGUSR1, _ask_to_stop)
         try:
             return carry_out(comm, request)
@@ -29,5 +29,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _ask_to_stop(number: int, _: FrameType | None) -> None:
-    """Stop the run after its first step, if it has not begun; do nothing after its last step."""
+    """Record a signal outside the steps: before the first step, the run stops after that step.
+
+    After the last step the signal has no effect.
+    """
     Stop.signal = number

@@ -18,7 +18,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"{folder} is a file, not a folder")
     if args.list:
         listed = list_study(args.study, folder, args.full)
-        # the number is the I of --part I/N if N is the number of cases
+        # if N is the number of cases, --part I/N runs the case of number I
         for number, (case, done) in enumerate(listed, 1):
             state = "done" if done else "open"
             print(f"{number:4} {state}  {case.scene}: {case.label}  {shown_command(case)}")
@@ -27,7 +27,7 @@ def run(args: argparse.Namespace) -> int:
     rows = run_study(
         args.study, folder, full=args.full, jobs=args.jobs, restart=args.restart, part=part
     )
-    # a failed case of a map is a result, not a loss
+    # in a map a failed case is a result
     if lost := len(failed(swept(as_table(rows)))):
         log.warning("%d case%s without figures: see the column reason", lost, "s" * (lost > 1))
     # the study that joins the parts writes the report

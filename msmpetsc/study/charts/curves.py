@@ -1,8 +1,8 @@
 """Charts of methods: cost over error, surface error over cost, growth with the number of cells.
 
-Two errors are kept apart. The step error is the distance of a step from the exact minimiser of its
-energy: it compares methods with the same time step. The trajectory error is the distance of a run
-from the true motion of the lattice: it compares integrators and time steps of any kind.
+There are two kinds of error. The step error is the distance of a step from the exact minimiser of
+its energy: it compares methods with the same time step. The trajectory error is the distance of a
+run from the true motion of the lattice: it compares all integrators and time steps.
 """
 
 from collections.abc import Sequence
@@ -72,8 +72,8 @@ def front(x: Sequence[float], y: Sequence[float]) -> list[int]:
 def front_rows(rows: DataFrame, columns: Columns) -> DataFrame:
     """Return the Pareto-optimal rows by error and cost, in the order of their error.
 
-    Errors that agree to two digits count as equal: solving a step better improves the trajectory
-    error only in later digits, which justify no cost.
+    Errors that agree to two digits count as equal. A smaller step error changes only later digits
+    of the trajectory error, which are not worth a cost.
     """
     error, cost = columns
     return rows.iloc[front([float(f"{value:.1e}") for value in rows[error]], list(rows[cost]))]
@@ -96,7 +96,7 @@ def pareto_charts(table: DataFrame, styles: Styles) -> list[Chart]:
 def pareto_chart(name: str, title: str, rows: DataFrame, styles: Styles) -> Chart:
     """Return the chart of a scene, with a panel for each measure of error that has data."""
     step = measured(rows, *STEP)
-    # only rows of equal time steps compare: take the time step with the most rows
+    # step errors compare only at equal time steps: take the step with the most rows
     by_step = grouped(step, "time_step").values()
     step = max(
         by_step, key=lambda group: (len(group), group["time_step"].fillna(0).iloc[0]), default=step
@@ -179,7 +179,7 @@ GROWTH_CAPTION = (
     "proportional to the cells. Memory is the peak of all ranks, including the program itself and "
     "the surface mesh. Whiskers reach from the least to the greatest of the repeats."
 )
-# columns that distinguish curves of a method, if they vary within it
+# columns that distinguish the curves of a method, if they vary
 VARIED = ("error", "max_iterations", "ranks")
 GROWTH_TIP = (
     "time_frame",
@@ -201,7 +201,7 @@ GROWTH_PANELS = (
 
 
 def growth_charts(table: DataFrame) -> list[Chart]:
-    """Return a chart for each scene and time step with at least two cell counts on a curve."""
+    """Return a chart for each scene and time step if a curve has at least two cell counts."""
     charts = []
     for (scene, time_step), rows in grouped(
         measured(succeeded(table), "cells"), "scene", "time_step"

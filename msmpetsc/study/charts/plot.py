@@ -62,7 +62,7 @@ class CurveStyle(NamedTuple):
     shape: str
 
 
-# style of each label, and columns on the x axis and the y axis
+# style of each label; names of the columns on the x axis and the y axis
 Styles = dict[str, CurveStyle]
 Columns = tuple[str, str]
 
@@ -84,7 +84,7 @@ def tips(rows: DataFrame, names: Iterable[str]) -> list[str]:
 
 
 def channel(title: str, words: str, **scale: Any) -> dict[str, Any]:
-    """Return an axis whose tick labels the Vega expression ``words`` formats."""
+    """Return an axis; the Vega expression ``words`` formats its tick labels."""
     return {
         "type": "quantitative",
         "title": title,
@@ -94,7 +94,7 @@ def channel(title: str, words: str, **scale: Any) -> dict[str, Any]:
 
 
 def log_axis(title: str, values: ArrayLike, words: str) -> dict[str, Any]:
-    """Return a logarithmic axis for positive values, with a factor of 2 beside them.
+    """Return a logarithmic axis for positive values, with a margin of a factor of 2 at both ends.
 
     NaN is ignored.
     """
@@ -117,7 +117,7 @@ class Axes:
     layers: list[dict[str, Any]] = field(default_factory=list)
 
     def draw(self, values: list[dict[str, Any]], mark: dict[str, Any], **channels: Any) -> None:
-        """Add a layer of values with columns x, y and the columns of the other channels."""
+        """Add a layer of values, each with x, y and the fields of the other channels."""
         if values:
             axes = {"x": {"field": "x"} | self.x, "y": {"field": "y"} | self.y}
             silent = {"aria": "description" in channels}
@@ -211,7 +211,7 @@ class Chart:
 
 
 def legend(styles: Styles) -> dict[str, Any]:
-    """Return an empty chart that shows the legend."""
+    """Return a chart that shows only the legend."""
     longest = max(map(len, styles), default=1)
     shown = {"title": None, "columns": max(1, int(WIDTH / (LETTER * longest + 40)))}
     channels = {"fill": nominal(styles, "color", shown), "shape": nominal(styles, "shape", shown)}

@@ -30,7 +30,7 @@ FARTHEST = 100.0
 
 
 def profile_charts(table: DataFrame, styles: Styles) -> list[Chart]:
-    """Return a chart for each set of methods that FEWEST or more problems have in common."""
+    """Return a chart for each set of methods that were run on at least FEWEST common problems."""
     return [
         profile_chart(f"profile_{number}" if number > 1 else "profile", problems, styles)
         for number, problems in enumerate(comparable(table), 1)
@@ -38,7 +38,7 @@ def profile_charts(table: DataFrame, styles: Styles) -> list[Chart]:
 
 
 def comparable(table: DataFrame) -> Iterator[list[DataFrame]]:
-    """Yield the rows of each problem that the same methods, at least two, were run on."""
+    """Yield, for each set of two or more methods, the rows of problems that all were run on."""
     rows = with_cells(table[~(table["max_iterations"] > 0)])
     by_methods: dict[frozenset[str], list[DataFrame]] = {}
     for _, group in rows.groupby(PROBLEM, sort=False, dropna=False):
@@ -49,9 +49,9 @@ def comparable(table: DataFrame) -> Iterator[list[DataFrame]]:
 
 
 def with_cells(rows: DataFrame) -> DataFrame:
-    """Return the rows with the cells of runs that were killed before they had counted them.
+    """Return the rows, with the missing cell counts of killed runs filled in.
 
-    A killed run has the cells that other methods have counted and its own method lacks.
+    A killed run gets a cell count that other methods have and its own method lacks.
     """
     rows = rows.copy()
     for _, group in rows.groupby(PROBLEM[:-1], sort=False, dropna=False):
@@ -65,7 +65,7 @@ def with_cells(rows: DataFrame) -> DataFrame:
 
 
 def ratios(problems: list[DataFrame], cost: str) -> DataFrame:
-    """Return the cost over the least cost of the problem: a row a problem, a column a method.
+    """Return cost over the least cost of a problem: a row per problem, a column per method.
 
     An entry is infinite if the method did not solve the problem.
     """

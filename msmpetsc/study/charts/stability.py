@@ -57,7 +57,7 @@ def entry(value: str, unit: str) -> str:
 
 
 def scale(rows: DataFrame, column: str, axis: dict[str, Any]) -> Scale:
-    """Return the axis of a column, with the order and the unit that the study file gives."""
+    """Return the axis of a column, in the order and with the unit that the study file gives."""
     listed = [str(float(value)) for value in axis.get("values", ())]
     measured = dict.fromkeys(rows[column])
     values = [value for value in dict.fromkeys([*listed, *measured]) if value in measured]
@@ -125,7 +125,7 @@ def draw_cells(panel: Axes, rows: DataFrame, x: Scale, y: Scale) -> None:
         }
         for row, tip in zip(records(placed), tips(placed, (*words, *TIP)), strict=True)
     ]  # fmt: skip
-    # the columns contain colours, so Vega must not map them
+    # the fields contain colours, which Vega must use as they are
     own = {"type": "nominal", "scale": None}
     fill = {"fill": {"field": "color"} | own, "description": {"field": "tip"}}
     panel.draw(values, {"type": "rect"}, **fill)

@@ -24,7 +24,7 @@ class PlannedMethod:
 
 @dataclass(frozen=True)
 class Budget:
-    """The parts of a surface error, each relative to the largest displacement [-]."""
+    """The surface error of the cells and of the time steps, over the largest displacement [-]."""
 
     cells: float
     time: float
@@ -37,7 +37,10 @@ class Budget:
 
 @dataclass(frozen=True)
 class Choice:
-    """A run with its expected error and cost: computing time per simulated time [s/s]."""
+    """A run that may be chosen, with its expected error and cost.
+
+    cost : computing time per simulated time [s/s]
+    """
 
     method: PlannedMethod
     cells: int
@@ -89,7 +92,7 @@ Tables = Mapping[str, Mapping[str, Any]]
 
 
 def tables(method: PlannedMethod) -> dict[str, dict[str, Any]]:
-    """Return the tables of a scene that a method determines; None stands for no key."""
+    """Return the scene's tables that a method determines; a key of value None is to be removed."""
     time = {"integrator": method.integrator, "error": method.time_error, "substep": None}
     if method.integrator == "verlet":
         return {"time": time}
@@ -122,5 +125,5 @@ def put_into(scene: Path, tables: Tables) -> None:
                 old.pop(key, None)
             elif old.get(key) != value:
                 old[key] = value
-    # tomlkit may end new lines in another way
+    # tomlkit may give new lines another line end
     write_whole(scene, tomlkit.dumps(document).replace("\r\n", "\n").replace("\n", line_end))

@@ -7,7 +7,7 @@ a finer run b, and the angle between the fields d and e_b of cosine c,
     e_a^2 = d^2 + e_b^2 + 2 c d e_b.
 
 Roache's method has c = 1: all errors have the same direction. Errors of lattices that do not nest
-have a random part as well; distances of three lattices determine c.
+also have a random part. The distances of three lattices determine c.
 """
 
 import math
@@ -18,9 +18,9 @@ from scipy.optimize import brentq
 
 # range of orders accepted: 1 for partly filled boundary cells, 2 for linear cells
 ORDERS = (1.0, 2.2)
-# steepest order through two runs [-]; so that powers of sizes stay finite
+# largest order through two runs [-]; keeps powers of sizes finite
 STEEPEST = 100.0
-# distance of a measured order below the range at which it still counts as observed
+# distance below the range within which a measured order still counts as observed [-]
 ORDER_TOLERANCE = 0.05
 
 
@@ -46,9 +46,9 @@ class ErrorLaw:
         return float((error / self.factor) ** (1 / self.order))
 
     def through(self, *known: tuple[float, float]) -> "ErrorLaw":
-        """Return the law through the (size, error) of a run, or of two runs, the coarser first.
+        """Return the law through one or two known (size, error), the coarser run first.
 
-        The order remains, unless two runs determine it.
+        The order changes only if two runs determine it.
         """
         (a, error_a), (b, error_b) = known[0], known[-1]
         order = self.order
@@ -57,7 +57,7 @@ class ErrorLaw:
         return replace(self, factor=error_a / a**order, order=order)
 
     def measured(self, distance: float, finer: float) -> float:
-        """Return the error of a run from its distance to a run of size ``finer``."""
+        """Return the error of a run from its distance to a run of the size ``finer``."""
         error = self.error(finer)
         return math.sqrt(distance**2 + error**2 + 2 * self.cosine * distance * error)
 
@@ -87,7 +87,7 @@ def error_law(
     distances : distances between consecutive runs
     orders    : least and greatest order accepted
     cosine    : cosine c of the angle between distance and error
-    assumed   : order if the distances show none, as those of two runs; the least if absent
+    assumed   : order if the distances show none, for example with two runs; the least if None
     """
     order = None
     if len(sizes) > 2 and distances[-1] > 0:
@@ -103,7 +103,7 @@ def error_law(
 def _order(
     sizes: Sequence[float], ratio: float, cosine: float, orders: tuple[float, float]
 ) -> float | None:
-    """Return the order that gives a ratio of distances, clipped; None if they show no order."""
+    """Return the order that gives a ratio of distances, clipped; None if there is no such order."""
     a, b, c = sizes[-3:]
     low, high = orders
 

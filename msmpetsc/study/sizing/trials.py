@@ -1,4 +1,4 @@
-"""Trial runs of a plan, which measure errors and costs of integrators and cells."""
+"""Trial runs of a plan: they measure the errors and costs of integrators and cell counts."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -23,32 +23,33 @@ from msmpetsc.study.sizing.choice import (
 )
 from msmpetsc.study.sizing.orders import ORDERS, ErrorLaw, cosine_of, error_law
 
-# ratio of cell edges of successive lattices, and of the scene to the finest choice
+# ratio of cell edges between successive lattices, and of the scene's lattice to the
+# finest choice [-]
 REFINEMENT = 2
-# powers of REFINEMENT by which the coarsest lattice is coarsened; the first that runs
+# powers of REFINEMENT that coarsen the coarsest lattice; the first that runs is used
 COARSEST_POWERS = (2.0, 5 / 3, 4 / 3)
 # least cells of the finest lattice in the first round
 START_CELLS = 1000
-# target / error of the motion by implicit steps; so that cells have most of the target
+# target over the time error of implicit steps [-]; leaves most of the target to cells
 STEP_MARGIN = 8
-# distance of lattices [-] above which the motions are out of phase and show no order
+# distance of lattices above which motions are out of phase and show no order [-]
 OUT_OF_PHASE = 0.15
 # order assumed if lattices show none; clamped bars show 1.5 to 2
 USUAL_ORDER = 1.5
 # time limits of a trial on coarse lattices and on the finest [s]
 TIMEOUT, FINEST_TIMEOUT = 150.0, 900.0
 MAX_CHOICES = 6
-# error / target that a choice aims at, and the least that ends the search
+# error over target at which a choice aims, and least ratio that ends the search [-]
 AIM, ACCEPTED = 0.9, 0.75
 
 
 class Sizer:
-    """Planner that runs trials of a scene for a surface error and reports each of them.
+    """Planner that runs trials of a scene for a surface error, and reports each trial.
 
     target  : largest surface error [-]
-    frames  : number of frames, from the scene's first, that the trials run
-    cells   : cells of the finest trial lattice; the scene's number if None
-    advised : cells on which the thin tenth of each body bends enough
+    frames  : number of the scene's first steps that the trials run
+    cells   : number of cells of the finest trial lattice; the scene's number if None
+    advised : number of cells on which the thin tenth of each body bends enough
     """
 
     def __init__(
@@ -92,7 +93,10 @@ class Sizer:
         return REFINEMENT**3 * self.cells
 
     def plan(self) -> SizePlan:
-        """Return the plan from trials, first on few cells. Raises InputError if too few succeed."""
+        """Return the plan, from trials first on few cells, then on more.
+
+        Raises InputError if too few trials succeed.
+        """
         finest = self.cells
         ratio = REFINEMENT**3
         # coarse cells lock thin walls, which hides the order of their error
@@ -112,7 +116,7 @@ class Sizer:
         law = self._law(lattices)
         wanted = fewest_cells(law, AIM * self.target - time_error)
         finest = lattices[-1]
-        # a choice cannot be measured from a lattice that is hardly finer
+        # the error of a choice cannot be measured on a lattice that is hardly finer
         if wanted > finest.cells / 2 and (finer := self._run(method, self._coarser(-0.5))):
             lattices = [*lattices[-2:], finer]
             law = self._law(lattices)
@@ -127,9 +131,11 @@ class Sizer:
     def _chosen_method(self, cells: int) -> tuple[PlannedMethod, float]:
         """Return the cheapest method and the error of its time steps [-].
 
-        Verlet, in steps of its stability limit, counts if it is near an implicit run, whose steps
-        are chosen by their error. Their distance is mostly that error, and an upper estimate of
-        verlet's. Raises InputError if no implicit run succeeds.
+        Verlet takes steps of its stability limit. It may be chosen if its run is near an implicit
+        run with steps chosen by their error. The distance of the two runs is mostly the time error
+        of the implicit run, so it is an upper estimate of verlet's time error.
+
+        Raises InputError if no implicit run succeeds.
         """
         if self.is_static:
             # static states have no error of a time step
@@ -150,7 +156,7 @@ class Sizer:
                     f"the step: runs of verlet and {implicit.method.integrator} are "
                     f"{distance:.1e} apart"
                 )
-            # its substeps shorten with the edges of cells
+            # verlet's substeps shorten with the edges of cells
             elif explicit.cost * REFINEMENT < implicit.cost:
                 return explicit.method, distance
         return implicit.method, allowed
@@ -167,7 +173,7 @@ class Sizer:
             run for power in COARSEST_POWERS if (run := self._run(method, self._coarser(power)))
         )
         finer = (self._run(method, self._coarser(power)) for power in (1, 0))
-        # different numbers of a few cells may give the same lattice
+        # with few cells, different numbers may give the same lattice
         runs = {run.edge: run for run in (next(coarsest, None), *finer) if run is not None}
         if len(runs) < 2:
             raise InputError(
@@ -180,8 +186,8 @@ class Sizer:
     def _law(self, runs: list[SizeTrial]) -> ErrorLaw:
         """Return the law of the cells' error from runs on two or three lattices.
 
-        If they show no order, the usual order is assumed. If cells are inverted, order 1 is
-        assumed: the inverted region shrinks no faster than the edge of a cell.
+        If the runs show no order, the usual order is assumed. If cells are inverted, order 1 is
+        assumed, because the inverted region shrinks no faster than the edge of a cell.
         """
         distances = [_distance(*pair) for pair in pairwise(runs)]
         across = _distance(runs[0], runs[-1])
@@ -198,7 +204,7 @@ class Sizer:
         return replace(law, observed=law.observed and not is_inverted)
 
     def _coarser(self, power: float) -> int:
-        """Return the cells of the lattice whose edges are REFINEMENT^power times as long."""
+        """Return the number of cells with edges REFINEMENT^power times as long."""
         cells: float = self.cells / REFINEMENT ** (3 * power)
         return max(1, round(cells))
 
@@ -207,8 +213,8 @@ class Sizer:
     ) -> SizePlan | None:
         """Choose, run and measure until the error is a little less than the target.
 
-        Each choice lies between cells that met the target and cells that did not, because the error
-        is not monotonic in the cells. Returns None if verlet fails on finer cells.
+        Each choice lies between numbers of cells that met and that missed the target, because the
+        error is not monotonic. Returns None if verlet fails on finer cells.
         """
         finest = lattices[-1]
         met = None
@@ -233,7 +239,7 @@ class Sizer:
                 break
             of_cells = law.error(run.edge)
             if run.cells <= finest.cells:
-                # the same method, so that only the cells differ
+                # both runs have the same method, so that only the cells differ
                 of_cells = law.measured(_distance(run, finest), finest.edge)
             measured = Budget(of_cells, time_error)
             error = measured.total / self.target

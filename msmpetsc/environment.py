@@ -8,6 +8,7 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Indices, Positions
 from msmpetsc.build import Model
+from msmpetsc.comm import reduced
 from msmpetsc.constraints.anchors import Anchor, Anchors
 from msmpetsc.constraints.forces import ActingForces
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
@@ -116,7 +117,7 @@ class Environment:
         if self._ended is None:
             return None
         ended, contact = self._ended
-        return contact if self.lattice.table.comm.allreduce(q is ended, MPI.LAND) else None
+        return contact if reduced(self.lattice.table.comm, q is ended, MPI.LAND) else None
 
     def end_step(self, x: Positions, contact: StepContact | None) -> None:
         """Record that a step ended at x (l, 3) [m], from which friction continues."""
@@ -129,7 +130,7 @@ class Environment:
         """
         if not (contact and self.has_friction):
             return False
-        used, at_end = self.lattice.table.comm.allreduce(contact.friction_limits(x))
+        used, at_end = reduced(self.lattice.table.comm, contact.friction_limits(x))
         return bool(max(at_end, used) > LAG_LIMIT * min(at_end, used))
 
     def forget(self) -> None:

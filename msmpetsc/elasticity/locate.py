@@ -4,6 +4,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, like, to_host
+from msmpetsc.comm import reduced
 from msmpetsc.elasticity.cell_volume import least_volumes, volume_ratios
 from msmpetsc.lattice.lattice import Lattice
 
@@ -52,7 +53,7 @@ def worst_inverted(
         volumes = least_volumes(q, cells)
     else:
         volumes = volume_ratios(q, cells, solid.forms, lattice.cell_size)
-    total = comm.allreduce(int((volumes <= 0).sum()))
+    total = reduced(comm, int((volumes <= 0).sum()))
     if not total:
         return 0, ""
     return total, _least(comm, lattice, cells, volumes)[1]

@@ -33,6 +33,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like, to_host
+from msmpetsc.comm import reduced
 from msmpetsc.contact.surface.pairs import ContactSummary
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.locate import describe_inverted, node_of_greatest
@@ -92,7 +93,7 @@ class EnergyBalance:
         self.comm = self.lattice.table.comm
         self.credit = OSCILLATION_CREDIT * self.swings
         self.energies = Energies(0.0, 0.0, 0.0, 0.0, 0.0, np.zeros(3), ContactSummary())
-        self.floor = FLOOR * self.comm.allreduce(crushing_energy(self.lattice))
+        self.floor = FLOOR * reduced(self.comm, crushing_energy(self.lattice))
 
     def show(self, q: Positions, v: Rows, time: float, sides: Indices | None) -> None:
         """Set ``energies`` to the energies at a time within a step or at its end (collective)."""
@@ -191,7 +192,7 @@ class EnergyBalance:
             return before.budget
         # Obstacles that reflect nodes change the state after the solve.
         is_changed = after.q is not result.position or after.q_previous is not result.previous
-        bounces = self.environment.obstacles.strikes and self.comm.allreduce(is_changed, MPI.LOR)
+        bounces = self.environment.obstacles.strikes and reduced(self.comm, is_changed, MPI.LOR)
         if bounces:
             ended = self._energies(after.q, after.velocity(time_step), time, after.sides)
         sums = self._start(before, result, after, time, time_step)
@@ -301,7 +302,7 @@ class EnergyBalance:
         return sums[[0, 2, 3, 4, 5]]
 
     def _sums(self, *values: SupportsFloat) -> Floats:
-        sums: Floats = self.comm.allreduce(np.array([float(value) for value in values]))
+        sums: Floats = reduced(self.comm, np.array([float(value) for value in values]))
         return sums
 
     def _worst(self, vectors: Rows) -> str:

@@ -13,6 +13,7 @@ from msmpetsc.backend.arrays import Indices, Positions, Rows, on_host, to_host
 from msmpetsc.backend.machine import return_free_memory
 from msmpetsc.build import Model, to_device
 from msmpetsc.checkpoint import AT_END, Checkpoint
+from msmpetsc.comm import reduced
 from msmpetsc.constraints.holders import sums_by
 from msmpetsc.contact.step_contact import StepContactAt
 from msmpetsc.elasticity.energy import Elasticity
@@ -393,7 +394,7 @@ class Forces:
                 q[:owned], reaction, self._torque_points(time)
             )
         return {
-            name: self.comm.allreduce(sums[name])
+            name: reduced(self.comm, sums[name])
             for name in sums
             if name == "load" or name in self.rows
         }

@@ -7,7 +7,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, greatest, like
-from msmpetsc.comm import log, on_root, together
+from msmpetsc.comm import log, on_root, reduced, together
 from msmpetsc.constraints.time_functions import Motion, Timed
 from msmpetsc.contact.obstacles.distance import FunctionSolid, MeshSolid
 from msmpetsc.contact.obstacles.solids import BallSolid, Faces, Planes, Send, Solid, no_sides
@@ -161,10 +161,10 @@ def describe_overlap(
     owned = slice(lattice.owned)
     inside, _ = obstacle.depths(q[owned], time)
     rows = np.flatnonzero((inside > TOUCHING * lattice.cell_size) & ~fixed[owned])
-    count = comm.allreduce(len(rows))
+    count = reduced(comm, len(rows))
     if not count:
         return None
-    deepest = comm.allreduce(greatest(inside[rows]), MPI.MAX)
+    deepest = reduced(comm, greatest(inside[rows]), MPI.MAX)
     nodes = f"{count} node{'s' if count > 1 else ''}"
     worst = node_of_greatest(comm, lattice, rows, inside[rows])
     cells = deepest / lattice.cell_size

@@ -7,6 +7,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, to_host
+from msmpetsc.comm import reduced
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.obstacles.penalty import ObstacleContact, Penalty
 from msmpetsc.contact.obstacles.reflection import Exchange, StepTaken, slowed
@@ -69,7 +70,7 @@ class NodeObstacles:
         rows = q[: self.lattice.owned]
         pressing = [row for row, p in enumerate(self.penalties) if p.obstacle.acts_at(time)]
         pushed = ([self._depths(row, (rows, side), time) for row in pressing] for side in (a, b))
-        return bool(self.lattice.table.comm.allreduce(all(map(np.array_equal, *pushed)), MPI.LAND))
+        return bool(reduced(self.lattice.table.comm, all(map(np.array_equal, *pushed)), MPI.LAND))
 
     def push(self, time: float, sides: Indices | None) -> StepContact | None:
         """Return the penalty contact at a time, without friction; None if no penalty acts."""

@@ -16,7 +16,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Mask, Positions, Rows
-from msmpetsc.comm import log, on_root
+from msmpetsc.comm import log, on_root, reduced
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw, CandidateSets, ContactSets
 from msmpetsc.contact.surface.continuous_collision import PIECE, collision_free_step, sweep
 from msmpetsc.contact.surface.creases import NEAREST
@@ -301,7 +301,7 @@ class ContactSearch:
 
     def _is_at(self, known: Positions, at: float, q: Positions, time: float) -> bool:
         """Return whether positions and obstacles' places equal known ones on all ranks."""
-        return self.same(at, time) and self.comm.allreduce(bool(np.array_equal(q, known)), MPI.LAND)
+        return self.same(at, time) and reduced(self.comm, bool(np.array_equal(q, known)), MPI.LAND)
 
     def same(self, begin: float, end: float) -> bool:
         """Return whether obstacles have the same places at two times [s]."""

@@ -26,7 +26,7 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.checkpoint import COUNT, LENGTH, Checkpoint, Range
-from msmpetsc.comm import log
+from msmpetsc.comm import log, reduced
 from msmpetsc.constraints.time_functions import AT_EVENT
 from msmpetsc.errors import StepFailed
 from msmpetsc.scene.reading import Scene
@@ -238,7 +238,7 @@ class Adaptive(Integrator):
         self.ticks = Ticks(self.time_step, steps, self.levels[0], self.environment.events())
         self.integrators: dict[int, Integrator] = {}
         self.tick = self.last = 0
-        self.mass = self.comm.allreduce(float(self.lattice.mass.sum()))
+        self.mass = reduced(self.comm, float(self.lattice.mass.sum()))
 
     def set_up(self) -> None:
         """Prepare the integrator of the first step, and log the range of step lengths."""
@@ -373,7 +373,7 @@ class Adaptive(Integrator):
                 free.any(axis=1) @ self.environment.obstacles.change_of_push(*ends, end, t)
             )
         sums += [mass @ (coming**2).sum(axis=1), late]
-        means = self.comm.allreduce(np.array([float(part) for part in sums])) / self.mass
+        means = reduced(self.comm, np.array([float(part) for part in sums])) / self.mass
         error, motion, coming, late = means
         late += result.begun_error / math.sqrt(self.mass)
         if not self.control.motion:

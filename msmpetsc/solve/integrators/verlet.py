@@ -28,7 +28,7 @@ from mpi4py import MPI
 from msmpetsc.backend.arrays import Floats, Mask, Positions, Rows, greatest
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.checkpoint import FINITE, Checkpoint, Range
-from msmpetsc.comm import log
+from msmpetsc.comm import log, reduced
 from msmpetsc.contact.obstacles.node_friction import Movers
 from msmpetsc.contact.obstacles.reflection import StepTaken
 from msmpetsc.contact.step_contact import StepContactAt
@@ -111,7 +111,7 @@ class Verlet(Integrator):
         self.known: Floats | None = None
         self.anchors: int | None = None
         self._fix(environment.anchors.fixed_at(self.time_step)[:owned])
-        self.unstable_energy = UNSTABLE * comm.allreduce(crushing_energy(self.lattice))
+        self.unstable_energy = UNSTABLE * reduced(comm, crushing_energy(self.lattice))
 
     def save(self, checkpoint: Checkpoint) -> None:
         checkpoint.keep_counts(self)
@@ -145,7 +145,7 @@ class Verlet(Integrator):
             # The energy below shows an overflow.
             with np.errstate(over="ignore", invalid="ignore"):
                 self._take_substeps(count, start, time)
-            energy = self.comm.allreduce(self.elasticity.energy(self.position.values))
+            energy = reduced(self.comm, self.elasticity.energy(self.position.values))
             after = np.inf
             if energy <= self.unstable_energy:
                 after = contact_bound + self.highest.squared_at(self.position.values)
@@ -222,8 +222,8 @@ class Verlet(Integrator):
         """
         own = self.elasticity.change(self.position.values, start) - float(self.springs_work)
         mass = self.lattice.mass[: self.lattice.owned, None]
-        gain, kinetic = self.comm.allreduce(
-            np.array([own, 0.5 * float(np.vdot(mass * self.v, self.v))])
+        gain, kinetic = reduced(
+            self.comm, np.array([own, 0.5 * float(np.vdot(mass * self.v, self.v))])
         )
         total = energy + kinetic
         limit = GAIN * total + ROUNDING * self.unstable_energy
@@ -351,12 +351,12 @@ class Verlet(Integrator):
         """Return Weyl's bound on the obstacles' part of omega^2 [1/s^2] (collective)."""
         fall = self._mean_load(start, time) * self.per_mass[:, None] * self.time_step
         speed = greatest(np.linalg.norm(np.abs(self.v) + np.abs(fall), axis=1))
-        speed = self.comm.allreduce(speed, MPI.MAX)
+        speed = reduced(self.comm, speed, MPI.MAX)
         stiffness = self.environment.obstacles.contact_stiffness_bound(
             self.q, speed, start, time, self.sides
         )
         squared = greatest(stiffness[self.free] * self.per_mass[self.free])
-        return float(self.comm.allreduce(squared, MPI.MAX))
+        return float(reduced(self.comm, squared, MPI.MAX))
 
     def _count(self, squared: float) -> int:
         """Return the least number of substeps for omega^2 [1/s^2]. Raises StepFailed."""

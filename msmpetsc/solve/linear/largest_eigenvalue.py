@@ -9,6 +9,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Floats, Mask, Positions, like
+from msmpetsc.comm import reduced
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.linear.ghosts import Ghosted
@@ -68,9 +69,7 @@ class HighestMode:
     def _normalise(self) -> float:
         """Scale the mode x to |x|_M = 1; return |x|_M from before (collective)."""
         x = self.mode.values[: self.lattice.owned]
-        size = float(
-            np.sqrt(self.comm.allreduce(float(np.vdot(self.lattice.mass[:, None] * x, x))))
-        )
+        size = float(np.sqrt(reduced(self.comm, float(np.vdot(self.lattice.mass[:, None] * x, x)))))
         if size > 0:
             x /= size
         self.mode.update()

@@ -13,6 +13,7 @@ from scipy.linalg.lapack import dpstrf
 from scipy.sparse import csr_array, eye_array, kron
 
 from msmpetsc.backend.arrays import Array, Rows
+from msmpetsc.comm import reduced
 from msmpetsc.contact.surface.surface_contact import SurfaceHessian
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.interpolation import Interpolation
@@ -50,7 +51,7 @@ class ContactSmoother:
             for c in range(3):
                 scaled.data = self.weights.data * self.inverse[self.weights.indices, r, c]
                 compliance[r::3, c::3] = (self.weights @ scaled.T).toarray()
-        compliance = self.comm.allreduce(compliance)
+        compliance = reduced(self.comm, compliance)
         root = root_of(t2 * surface.points.toarray())
         lower = np.linalg.cholesky(np.eye(root.shape[1]) + root.T @ compliance @ root)
         root = solve_triangular(lower, root.T, lower=True, check_finite=False)
@@ -60,7 +61,7 @@ class ContactSmoother:
         """Change y (3, m) from D^-1 x to (D + C)^-1 x (collective)."""
         moved = self.weights @ y[:, self.nodes].T
         if self.comm.size > 1:
-            moved = self.comm.allreduce(moved)
+            moved = reduced(self.comm, moved)
         back = self.back @ (self.middle @ moved.ravel()).reshape(-1, 3)
         y[:, self.nodes] -= np.einsum("mrc,mc->rm", self.inverse, back)
 

@@ -18,7 +18,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Rows, like, to_host
-from msmpetsc.comm import Route
+from msmpetsc.comm import Route, reduced
 from msmpetsc.geometry.morton import LIMIT, decode_morton, encode_morton
 from msmpetsc.geometry.partition import SortedKeys
 from msmpetsc.solve.linear.unknowns import Unknowns
@@ -41,7 +41,7 @@ class Bodies:
         Shifted along the first axis, bodies share no coarse cell. Pinned nodes have offset 0. If
         the grid indices have no room, all offsets are 0.
         """
-        farthest = comm.allreduce(int(decode_morton(keys).max(initial=0)), MPI.MAX)
+        farthest = reduced(comm, int(decode_morton(keys).max(initial=0)), MPI.MAX)
         # A power of two above the extent separates bodies on coarser grids as well. It
         # has none of the bits of the nodes, so its key may be added to theirs.
         room = 2 << farthest.bit_length()
@@ -92,7 +92,7 @@ def _labels(unknowns: Unknowns, part: Indices) -> Indices:
         smaller[lattice.owned :] = np.minimum(
             smaller[lattice.owned :], to_owner.answer(smaller[asked])
         )
-        is_new = comm.allreduce(bool((smaller < label).any()), MPI.LOR)
+        is_new = reduced(comm, bool((smaller < label).any()), MPI.LOR)
         label = smaller
     return label
 
@@ -137,5 +137,5 @@ class Translations:
     def _sums(self, rows: Rows) -> Floats:
         """Return the sums (r, b) of rows (r, m) over the nodes of each free body."""
         own = [to_host(np.bincount(self.body, row, self.count + 1)[: self.count]) for row in rows]
-        sums: Floats = self.unknowns.comm.allreduce(np.array(own).reshape(len(rows), self.count))
+        sums: Floats = reduced(self.unknowns.comm, np.array(own).reshape(len(rows), self.count))
         return sums

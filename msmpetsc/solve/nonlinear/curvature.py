@@ -16,6 +16,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Floats, Positions, Rows, greatest, like, to_host
 from msmpetsc.checkpoint import ANY, Checkpoint, Range
+from msmpetsc.comm import reduced
 from msmpetsc.solve.linear.operators import TrueHessian
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 from msmpetsc.solve.nonlinear.lobpcg import (
@@ -140,7 +141,7 @@ class LowestCurvature:
             # number of ranks takes the same side.
             down = modes[: int((values <= ALIKE * values[0]).sum())]
             noise = self.search.random(1)[0]
-            parts = self.comm.allreduce(to_host((down * self.functional.mass) @ noise))
+            parts = reduced(self.comm, to_host((down * self.functional.mass) @ noise))
             return values[0], like(down, parts / max(np.linalg.norm(parts), TINY)) @ down
         return values[0], self.mode
 
@@ -227,7 +228,7 @@ class LowestCurvature:
         # Orthogonalised twice: the first pass leaves rounding
         for _ in range(2):
             sizes, parts = np.linalg.eigh(
-                self.comm.allreduce(to_host((motions * self.functional.mass) @ motions.T))
+                reduced(self.comm, to_host((motions * self.functional.mass) @ motions.T))
             )
             kept = sizes > DEPENDENT * sizes[-1]
             motions = like(motions, (parts[:, kept] / np.sqrt(sizes[kept])).T) @ motions

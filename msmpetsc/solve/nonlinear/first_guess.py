@@ -3,6 +3,7 @@
 import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Positions, Rows, like, to_host
+from msmpetsc.comm import reduced
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 
 
@@ -69,5 +70,5 @@ class FirstGuess:
             return 0.0
         mass = self.functional.lattice.mass
         sums = np.append(to_host(mass @ moved[: len(mass)]), float(mass.sum()))
-        sums = self.functional.comm.allreduce(sums)
+        sums = reduced(self.functional.comm, sums)
         return like(moved, sums[:3] / sums[3])

@@ -16,6 +16,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, greatest, like, to_host
+from msmpetsc.comm import reduced
 from msmpetsc.contact.step_contact import StepContact, StepContactAt
 from msmpetsc.contact.surface.surface_contact import SurfaceContact
 from msmpetsc.elasticity.energy import Elasticity
@@ -112,7 +113,7 @@ class StepFunctional:
             self.elasticity.viscosity.begin(*problem.rates)
         if self.elasticity.pressures and problem.pressures:
             self.elasticity.pressures.values = problem.pressures
-        self.extent = self.comm.allreduce(greatest(np.abs(problem.q)), MPI.MAX)
+        self.extent = reduced(self.comm, greatest(np.abs(problem.q)), MPI.MAX)
 
     def positions(self, x: PETSc.Vec) -> Positions:
         """Return positions (l, 3) [m] of unknowns x, with fixed nodes at their places."""
@@ -171,7 +172,7 @@ class StepFunctional:
             acting += problem.contact.energy(q)
             acting += problem.contact.change_of_friction(q, problem.y)
         inertia = 0.5 * self._inner(moved, moved)
-        return float(self.comm.allreduce(inertia + self.t2 * acting))
+        return float(reduced(self.comm, inertia + self.t2 * acting))
 
     def change(self, q: Positions, base: Positions) -> tuple[float, float]:
         """Return g(q) - g(base) [kg m^2] and |q - base|^2 [m^2] of positions (l, 3) [m].
@@ -187,8 +188,8 @@ class StepFunctional:
             if problem.contact:
                 with CONTACT:
                     elastic += problem.contact.change(q, base)
-            change, squared = self.comm.allreduce(
-                np.array([inertia + self.t2 * elastic, float(np.vdot(moved, moved))])
+            change, squared = reduced(
+                self.comm, np.array([inertia + self.t2 * elastic, float(np.vdot(moved, moved))])
             )
         return change, squared
 
@@ -223,19 +224,19 @@ class StepFunctional:
 
     def norm(self, displacement: PETSc.Vec) -> float:
         """Return |v|_M = sqrt(v^T M v)."""
-        return float(np.sqrt(self.comm.allreduce(self._square(displacement))))
+        return float(np.sqrt(reduced(self.comm, self._square(displacement))))
 
     def dual_norm(self, f: PETSc.Vec) -> float:
         """Return |f|_(M^-1).
 
         |F|_(M^-1) bounds |x - x*|_M if E is convex: the Hessian of g is then at least M.
         """
-        return float(np.sqrt(self.comm.allreduce(self._dual_square(f))))
+        return float(np.sqrt(reduced(self.comm, self._dual_square(f))))
 
     def norms(self, displacement: PETSc.Vec, f: PETSc.Vec) -> tuple[float, float]:
         """Return |v|_M and |f|_(M^-1) by a single sum over the ranks."""
         own = np.array([self._square(displacement), self._dual_square(f)])
-        of_v, of_f = np.sqrt(self.comm.allreduce(own))
+        of_v, of_f = np.sqrt(reduced(self.comm, own))
         return float(of_v), float(of_f)
 
     def _square(self, displacement: PETSc.Vec) -> float:
@@ -259,7 +260,7 @@ class StepFunctional:
         if correction is not None:
             columns -= self.memory.read(correction)
         columns *= columns
-        return float(np.sqrt(self.comm.allreduce(float(columns @ self.mass))))
+        return float(np.sqrt(reduced(self.comm, float(columns @ self.mass))))
 
 
 class Rounding:
@@ -274,8 +275,8 @@ class Rounding:
         self.functional, self.comm, self.diagonal = functional, functional.comm, diagonal
         # Rounding of the rows of F [kg m] per metre of a coordinate
         self.rows = np.tile(ROUNDINGS * diagonal, 3)
-        stiffness, mass = self.comm.allreduce(
-            np.array([3 * float(diagonal.sum()), float(functional.mass.sum())])
+        stiffness, mass = reduced(
+            self.comm, np.array([3 * float(diagonal.sum()), float(functional.mass.sum())])
         )
         # An error of eps k in the forces moves nodes by at most eps sqrt(sum of t^2 k).
         # This holds in the norm of a positive definite H, and so in that of M. The
@@ -287,7 +288,7 @@ class Rounding:
         functional = self.functional
         load = np.sqrt((functional.problem.load[functional.unknowns.free] ** 2).sum(axis=1))
         local = np.array([greatest(load), functional.t2 * greatest(load / self.diagonal)])
-        most, moved = np.max(self.comm.allgather(local), axis=0)
+        most, moved = reduced(self.comm, local, MPI.MAX)
         if moved > FARTHEST * functional.extent:
             raise InputError(
                 f"loads of up to {most:.2g} N on a node would move it by {moved:.2g} m in a step, "
@@ -309,8 +310,8 @@ class Rounding:
         rows = np.abs(functional.memory.read(iterate.f)) / (
             known * max(functional.extent, np.finfo(float).tiny)
         )
-        squares, count = self.comm.allreduce(np.array([float(rows @ rows), rows.size]))
-        return bool(squares <= count and self.comm.allreduce(greatest(rows), MPI.MAX) <= SINGLE_ROW)
+        squares, count = reduced(self.comm, np.array([float(rows @ rows), rows.size]))
+        return bool(squares <= count and reduced(self.comm, greatest(rows), MPI.MAX) <= SINGLE_ROW)
 
     @property
     def displacement(self) -> float:

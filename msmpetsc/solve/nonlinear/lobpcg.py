@@ -13,6 +13,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Floats, Rows, greatest, like, to_host
+from msmpetsc.comm import reduced
 from msmpetsc.solve.linear.operators import TrueHessian
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
@@ -176,13 +177,13 @@ class Lobpcg:
     def _add_residual(self, space: SearchSpace, i: int, value: float) -> float:
         """Add the preconditioned residual of the i-th Ritz vector; return its error r^T P^-1 r."""
         residual = space.products[i] - value * self.functional.mass * space.directions[i]
-        scale = max(self.comm.allreduce(float(greatest(np.abs(residual))), MPI.MAX), TINY)
+        scale = max(reduced(self.comm, float(greatest(np.abs(residual))), MPI.MAX), TINY)
         # Multigrid works in single precision
         residual /= scale
         w = space.directions[space.used]
         self._of_each(self.preconditioner.apply, residual[None], w[None])
         space.used += 1
-        error: float = self.comm.allreduce(float(residual @ w)) * scale**2
+        error: float = reduced(self.comm, float(residual @ w)) * scale**2
         return error
 
     def _ritz(self, space: SearchSpace, size: int) -> Floats:
@@ -191,7 +192,7 @@ class Lobpcg:
         The space then has the Ritz vectors, of unit length. After them come the conjugate
         directions: the parts of the Ritz vectors outside the first ``size`` directions.
         """
-        grams = self.comm.allreduce(space.grams(self.functional.mass))
+        grams = reduced(self.comm, space.grams(self.functional.mass))
         lengths = np.sqrt(np.maximum(grams[1].diagonal(), TINY))
         grams = grams / lengths / lengths[:, None]
         sizes, parts = np.linalg.eigh(0.5 * (grams[1] + grams[1].T))
@@ -208,7 +209,7 @@ class Lobpcg:
         """Return directions (k, n) without their parts in directions ``left_out`` (r, n)."""
         if left_out is None:
             return directions
-        parts = self.comm.allreduce(to_host((directions * self.functional.mass) @ left_out.T))
+        parts = reduced(self.comm, to_host((directions * self.functional.mass) @ left_out.T))
         return directions - like(directions, parts) @ left_out
 
     def _of_each(self, act: Act, directions: Rows, results: Rows) -> None:
@@ -224,6 +225,6 @@ class Lobpcg:
 
     def unit(self, directions: Rows) -> Rows:
         """Return directions scaled to unit length in the norm of M; zero directions stay zero."""
-        squares: Floats = self.comm.allreduce(to_host(directions**2 @ self.functional.mass))
+        squares: Floats = reduced(self.comm, to_host(directions**2 @ self.functional.mass))
         lengths: Rows = like(directions, np.maximum(np.sqrt(squares), TINY))[:, None]
         return directions / lengths

@@ -18,6 +18,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Array, Positions
+from msmpetsc.comm import reduced
 from msmpetsc.contact.step_contact import StepContactAt
 from msmpetsc.solve.nonlinear.curvature import Alarm
 from msmpetsc.solve.nonlinear.error_control import Outcome
@@ -273,7 +274,7 @@ class Newton(StepMethod):
         """
         functional, bent = self.functional, self.end
         stopped = contact.stopped(end)
-        if not functional.comm.allreduce(stopped is not None, MPI.LOR):
+        if not reduced(functional.comm, stopped is not None, MPI.LOR):
             return end
         functional.unknowns.from_nodes(end if stopped is None else stopped, bent)
         # Fixed nodes stay at their places

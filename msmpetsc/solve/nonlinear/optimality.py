@@ -12,6 +12,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Floats, Positions, greatest
+from msmpetsc.comm import reduced
 from msmpetsc.solve.nonlinear.curvature import LowestCurvature
 from msmpetsc.solve.nonlinear.error_control import Outcome
 from msmpetsc.solve.nonlinear.error_estimate import ErrorEstimate
@@ -168,8 +169,8 @@ class Optimality:
         Return None if g rises.
         """
         functional, base = self.functional, at.q
-        slope = functional.comm.allreduce(float(self.memory.read(at.f) @ direction))
-        longest = float(functional.comm.allreduce(greatest(np.abs(direction)), MPI.MAX))
+        slope = reduced(functional.comm, float(self.memory.read(at.f) @ direction))
+        longest = float(reduced(functional.comm, greatest(np.abs(direction)), MPI.MAX))
         move = FIRST_MOVE * functional.lattice.cell_size / longest
         # A smaller slope may be rounding: then g falls in both directions, and all
         # ranks take the same

@@ -11,6 +11,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Positions, Rows, like
+from msmpetsc.comm import reduced
 from msmpetsc.contact.step_contact import StepContactAt
 from msmpetsc.contact.surface.surface_contact import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity
@@ -133,7 +134,7 @@ class MatrixPreconditioner(StepPreconditioner):
         bound = (contact.bound() if contact else np.zeros(lattice.owned, like=q))[
             self.unknowns.free
         ]
-        changed = bool(lattice.table.comm.allreduce(not np.array_equal(bound, self.added), MPI.LOR))
+        changed = bool(reduced(lattice.table.comm, not np.array_equal(bound, self.added), MPI.LOR))
         if changed:
             self.added = bound
             self.unknowns.memory.write(self.vector)[:] = self.own + self.t2 * bound
@@ -209,7 +210,7 @@ class LatticePreconditioner(StepPreconditioner):
     def _follow(self, contact: Rows) -> bool:
         """Give the hierarchy the present contact (owned, 9) [N/m]; return whether it changed."""
         changed = not np.array_equal(contact, self.multigrid.fine.contact)
-        changed = bool(self.unknowns.comm.allreduce(changed, MPI.LOR))
+        changed = bool(reduced(self.unknowns.comm, changed, MPI.LOR))
         if changed:
             with HIERARCHY:
                 self.multigrid.follow(contact)
@@ -263,7 +264,7 @@ class LatticePreconditioner(StepPreconditioner):
         # The self-contact of a lone body moves its centre no more than springs do
         if surface and not alone and surface.presses(q):
             return False
-        return not self.unknowns.comm.allreduce(contact.presses_nodes, MPI.LOR)
+        return not reduced(self.unknowns.comm, contact.presses_nodes, MPI.LOR)
 
     def _blocks(self, contact: StepContactAt | None) -> Rows:
         """Return the Hessian (owned, 9) of obstacles, with the secant of friction.

@@ -7,7 +7,7 @@ from spack_repo.builtin.build_systems.python import PythonPackage
 
 
 class PyMsmpetsc(PythonPackage):
-    """Elastic bodies from closed surface meshes: solids and springs on lattices, stepped with PETSc."""
+    """Elastic bodies from closed surface meshes: solids and springs, by PETSc."""
 
     pypi = "msmpetsc/msmpetsc-0.2.0.tar.gz"
     license("BSD-3-Clause")

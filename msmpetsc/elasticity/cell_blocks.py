@@ -16,7 +16,7 @@ from msmpetsc.lattice.lattice import Lattice
 
 # number of a cell's constants [-]: its form (lattice.cell_moments), then m = mu V /
 # (16 h^2) and lambda V / (16 h^2). The form's entries for modes are multiplied by m
-# and, but for XYZ, by 1 - s (elasticity.assumed_strain).
+# and, except for XYZ, by 1 - s (elasticity.assumed_strain).
 ROWS = FORM + 2
 # numbers of a cell in a projected Hessian's state [-]: F by rows, then V U' and V U''
 # over 16 h^2

@@ -31,7 +31,8 @@ ACCURACY = 1e-7
 # (omega tau)^2 below which a mode is rigid [-]; above rounding, and below the bending
 # of bars a thousand times as long as thick
 RIGID = 1e-5
-# Relative difference of (omega tau)^2 up to which modes are alike [-]; above ACCURACY
+# Relative difference of (omega tau)^2 up to which modes count as equal [-]; above
+# ACCURACY
 ALIKE = 1e-6
 # Number of modes searched beyond the wanted modes [-]; lets all wanted modes converge
 SPARE = 4
@@ -136,8 +137,8 @@ def _lowest(search: Lobpcg, count: int) -> tuple[Floats, Rows]:
 def _turned(search: Lobpcg, squares: Floats, modes: Rows) -> Rows:
     """Return the modes in a basis that does not depend on rounding.
 
-    Mode i of a group of modes alike is orthogonal to the first i noise vectors, counted from 0. Its
-    product with noise vector i is positive.
+    Mode i of a group of equal frequencies is orthogonal to the first i noise vectors, counted from
+    0. Its product with noise vector i is positive.
     """
     noise = search.functional.noise(len(modes))
     parts = search.comm.allreduce((modes * search.functional.mass) @ noise.T)

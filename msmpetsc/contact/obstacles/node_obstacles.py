@@ -166,8 +166,8 @@ class NodeObstacles:
     ) -> tuple[float, Floats]:
         """Return the sum of penalty forces [N], and the sum (3,) [N m] of force times displacement.
 
-        Both sums run over this rank's nodes, at a step's start and at its end. The displacements
-        are those of the obstacles in the step.
+        Both sums run over this rank's nodes, at a step's start and at its end. The displacement is
+        the obstacle's in the step.
         """
         total, weighted = 0.0, np.zeros(3)
         for row, p in enumerate(self.penalties):

@@ -43,8 +43,8 @@ TINY = np.finfo(float).tiny
 class CollisionSurface:
     """Surface of bodies and obstacles in contact.
 
-    surface      : surface of bodies without crossing triangles, then of obstacles; None but on
-                   rank 0
+    surface      : surface of bodies without crossing triangles, then of obstacles, on rank 0; None
+                   elsewhere
     points       : W, from positions of nodes to points of the surface
     meets_itself : False if bodies meet obstacles alone
     parts        : name and number of points of each body and obstacle, on rank 0
@@ -257,9 +257,9 @@ class ContactSearch:
         return self._moments[0]
 
     def narrow(self, q: Positions, time: float) -> bool:
-        """Use only candidates around the contacts at q and a time [s]. Return whether this is done.
+        """Use only candidates around the contacts at q and a time [s], and around earlier contacts.
 
-        Contacts of earlier calls count, too. If too many points touch, all candidates are used.
+        Return whether the step is narrow. If too many points touch, the step uses all candidates.
         """
         moment, touched = self.find(q, time), None
         if self.barrier and moment.count:
@@ -284,8 +284,8 @@ class ContactSearch:
         """Return whether the path of a narrow step from q to x is free, and whether x is right.
 
         The solution x is right if the contact energy of all pairs is within ``left_out`` [J] of the
-        energy of the pairs used. All candidates are used afterwards. But if the path is free and x
-        is not right, the step stays narrow, with the candidates around all contacts at x.
+        energy of the pairs used. Afterwards the step uses all candidates. But if the path is free
+        and x is not right, the step stays narrow, with the candidates around all contacts at x.
         """
         known = ContactSummary() if self.is_left_out else self.touch(x, self.time)
         self.widen()

@@ -161,7 +161,7 @@ class SurfaceContact:
         return replace(friction, limit=np.clip(2 * friction.limit - before, 0, 2 * friction.limit))
 
     def friction_limits(self, q: Positions) -> Floats:
-        """Return the sums of mu N [N], (2,): as friction uses it, and at q. Zeros but on rank 0."""
+        """Return the sums of mu N [N], (2,), as friction uses it and at q; 0 on ranks above 0."""
         moment, barrier = self.contacts.find(q), self.contacts.barrier
         if self.contacts.law.friction == 0 or not barrier:
             return np.zeros(2)
@@ -275,7 +275,7 @@ class SurfaceContact:
         """Return the sum of forces [N], and the sum (3,) [N m] of force times displacement.
 
         Both sums run over obstacles' points, at a step's start and at its end, without friction.
-        They are zero but on rank 0.
+        They are zero on ranks above 0.
         """
         contacts, total, weighted = self.contacts, 0.0, np.zeros(3)
         if contacts.obstacles.total:
@@ -346,7 +346,7 @@ class SurfaceContact:
     def _negative_part(self, moment: SurfaceContactsAt) -> tuple[Indices, Floats] | None:
         """Return points (k,) at which the Hessian has a negative part, and its row sums (k,) [N/m].
 
-        Return None on all ranks but rank 0.
+        On ranks above 0, return None.
         """
         whole, kept = (self._whole_hessian(moment, projected, None) for projected in (False, True))
         if whole is None or kept is None:

@@ -336,8 +336,8 @@ class Adaptive(Integrator):
     def _start_of(self, state: State, level: int, restarts: bool) -> State:
         """Return the state from which a step of a level starts; ``restarts`` drops the history.
 
-        If the last step had another level, its mean acceleration a extrapolates the history. Then
-        loads have changed the velocity in proportion to their impulse in the last step (Bdf2).
+        If the last step had another level, its mean acceleration a gives the history. Then loads
+        have changed the velocity in proportion to their impulse in the last step (Bdf2).
         """
         q, v, t, span = state.q, state.velocity(self.time_step), self._length(level), None
         history = None if restarts or self.order < 2 else state.history

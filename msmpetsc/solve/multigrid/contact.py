@@ -92,7 +92,7 @@ class CoarseContact:
     ) -> PETSc.Mat:
         """Return a copy of the coarsest matrix with contact, or the matrix itself without contact.
 
-        blocks : diagonal blocks (n, 9) of each level but the coarsest, to which contact is added
+        blocks : diagonal blocks (n, 9) of each level except the coarsest, to which contact is added
         """
         if surface is None:
             return coarsest

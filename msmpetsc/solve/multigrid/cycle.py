@@ -8,8 +8,8 @@ CG with the true Hessian has a positive definite preconditioner. The finest leve
 by spring or cell by cell in single precision, with a block diagonal D in its smoother. The first
 coarse matrix is also summed over springs or cells (solve.multigrid.galerkin). PETSc computes the
 coarser matrices as products P^T H P. P is the same for x, y and z. So PETSc multiplies the nine
-entries of the blocks one after the other, as matrices of the nodes. On a CPU all coarse levels but
-the coarsest multiply in single precision (solve.multigrid.coarse_products).
+entries of the blocks one after the other, as matrices of the nodes. On a CPU all coarse levels
+except the coarsest multiply in single precision (solve.multigrid.coarse_products).
 """
 
 from collections.abc import Iterator
@@ -95,8 +95,8 @@ class Multigrid:
     fine   : operator of the finest level
     pc     : the PCMG, with the options of the ``prefix``
     levels : coarse levels, the finest first
-    coarse : single-precision products of all coarse levels but the coarsest; empty on a GPU
-    bounds : largest eigenvalue of D^-1 H of each level but the coarsest, the finest level first
+    coarse : single-precision products of all coarse levels except the coarsest; empty on a GPU
+    bounds : largest eigenvalue of D^-1 H of each level except the coarsest, the finest first
 
     Raises InputError for options that do not fit the lattice.
     """

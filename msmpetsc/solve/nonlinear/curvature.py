@@ -208,9 +208,10 @@ class LowestCurvature:
         return search.lowest(start, block, LONGEST_SEARCH, least // 2)
 
     def _rigid_motions(self, q: Positions) -> Rows | None:
-        """Return translations and rotations (6, n) of a free body at positions q (l, 3) [m].
+        """Return translations and rotations (k, n), k <= 6, of a free body at positions q (l, 3).
 
-        They are orthonormal in M. Return None if nodes or components are fixed.
+        The motions are orthonormal in M; degenerate bodies have fewer than 6. Return None if nodes
+        or components are fixed.
         """
         if self.unknowns.has_fixed:
             return None

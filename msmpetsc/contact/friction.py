@@ -1,19 +1,20 @@
-"""Law of Coulomb friction in implicit steps, for nodes on obstacles and for surfaces.
+"""Coulomb friction in implicit steps, for nodes on obstacles and for surfaces in contact.
 
 The normal force N is known before the step is solved. Then friction has the convex potential
 mu N f(|u|) of the slip u (Li et al. 2020, Incremental Potential Contact, Eq. 12 to 15), with
 
     f(u) = u^2 / e - u^3 / (3 e^2) + e / 3  for u < e,    f(u) = u  for u >= e.
 
-Li et al. start each step at zero slip, so a sticking contact creeps. Here the elastic part of the
-slip, at most e, continues in the next step, and a sticking contact rests. Source: Simo and Laursen
-1992, An augmented Lagrangian treatment of contact problems involving friction.
+A contact sticks if its slip is shorter than e, and slides otherwise. Li et al. start each step at
+zero slip, so a sticking contact creeps. Here the elastic part of the slip, at most e long,
+continues in the next step, and a sticking contact rests. Source: Simo and Laursen 1992, An
+augmented Lagrangian treatment of contact problems involving friction.
 
 A sliding contact has no curvature along its slip, so a step with the true Hessian may reverse the
-slip and go much too far. Newton's method therefore has the friction force p, in units of mu N, as a
-dual unknown: p = (f'/u) u, linearised in both. The Hessian is the true one if p is the force of the
-present slip. Otherwise it is stiffer. Source: Chan, Golub and Mulet 1999, A nonlinear primal-dual
-method for total variation-based image restoration, SIAM J. Sci. Comput. 20.
+slip and go much too far. Newton's method therefore treats the friction force p, in units of mu N,
+as a dual unknown. It linearises p = f'(|u|) u / |u| in p and u. If p is the force of the present
+slip, the Hessian is the true Hessian; otherwise it is stiffer. Source: Chan, Golub and Mulet 1999,
+A nonlinear primal-dual method for total variation-based image restoration, SIAM J. Sci. Comput. 20.
 """
 
 from dataclasses import dataclass
@@ -22,8 +23,8 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Positions, Rows
 
-# default of e over the time step [longest side of the smallest body / s]; below this
-# speed a contact sticks
+# default slip speed e / (time step) below which a contact sticks [longest side of the
+# smallest body / s]
 STICK = 1e-2
 # smallest f' to divide by [-]; the square of the quotient does not overflow
 TINY_SLOPE = 1e-100
@@ -43,7 +44,7 @@ class Friction:
     begin: Rows
 
     def along(self, moved: Rows) -> Rows:
-        """Return the slip (a, 3) [m] of displacements ``moved`` (n, 3) [m]."""
+        """Return the slips (a, 3) [m] that displacements ``moved`` (n, 3) [m] cause."""
         raise NotImplementedError
 
     def slip(self, q: Positions) -> tuple[Rows, Floats]:
@@ -55,7 +56,7 @@ class Friction:
 
         The change of |u| is computed from the displacement, so a small change keeps its digits.
 
-        moved : (n, 3) q - base [m], if it is known with more digits
+        moved : (n, 3) q - base [m], if the caller knows it with more digits
         """
         u, length = self.slip(q)
         u_0, length_0 = self.slip(base)
@@ -100,7 +101,7 @@ class Friction:
     def no_duals(self) -> Rows:
         """Return zero duals (a, 3), for which ``curvature`` is the secant mu N (f'/u) (I - n n^T).
 
-        f is concave in u^2, so the secant's parabola is nowhere below the potential.
+        f is concave in u^2, so the parabola with this curvature bounds the potential from above.
         """
         return np.zeros((len(self.limit), 3), like=self.limit)
 
@@ -121,10 +122,11 @@ class Friction:
     def curvature(self, q: Positions, plane: Rows, duals: Rows | None) -> Rows:
         """Return mu N (f'/u (I - n n^T) + (f'' - f'/u) (w d^T + d w^T) / 2) (a, 3, 3) [N/m].
 
-        d is the slip's direction. w = p / f' is at most 1 in length, so no block is negative.
+        d is the slip's direction. w is p / f', scaled down to length 1 if longer, so that each
+        block is positive semidefinite.
 
         plane : (a or 1, 3, 3) I - n n^T
-        duals : (a, 3) p; None for the forces of the slips, w = d, which gives the true Hessian
+        duals : (a, 3) p; None for the forces of the slips: then w = d, and the Hessian is true
         """
         u, length = self.slip(q)
         slope = self.slope(length)
@@ -139,7 +141,7 @@ class Friction:
         return self.limit[:, None, None] * blocks
 
     def _bend(self, u: Floats) -> Floats:
-        """Return f'' - f' / u <= 0 (a,) [1/m]: the curvature along the slip minus that across."""
+        """Return f'' - f' / u <= 0 (a,) [1/m]: curvature along the slip minus curvature across."""
         difference: Floats = np.where(u < self.stick, 2 * (1 - u / self.stick) / self.stick, 0.0)
         difference -= self.slope(u)
         return difference

@@ -1,4 +1,4 @@
-"""Contact energy of a step: obstacles that nodes meet, and surfaces that meet.
+"""Contact energy of a step: penalties of obstacles on nodes, and contact of surfaces.
 
 ``StepContact.at`` finds the nodes inside each obstacle at given positions. Gradient, Hessian and
 bounds share these nodes.
@@ -15,10 +15,11 @@ from msmpetsc.contact.obstacles.node_friction import Movers, Pressed, apply_fric
 from msmpetsc.contact.obstacles.penalty import ObstacleContact
 from msmpetsc.contact.surface.surface_contact import SurfaceContact
 
-# depth at which nodes are stopped, over the depth that they would have [-]; above 0, so
-# that the Hessian has contact
+# depth of a stopped node over its depth without the stop [-]; above 0, so that the
+# Hessian includes the contact
 STOP_DEPTH = 1e-3
-# duals (a, 3) of each obstacle's friction and of the surface's; None for slips' forces
+# duals (a, 3) of friction for each obstacle, then for the surface; None for the forces
+# of the present slips
 Duals = list[Rows | None]
 
 
@@ -28,7 +29,9 @@ class StepContact:
     Positions q are (owned or more, 3) [m]. The Hessian of obstacles has a 3 x 3 block per node in
     contact. Methods that use the surface are collective.
 
-    surface : self-contact of the scene; None if it has none
+    states  : penalty contact with each obstacle
+    owned   : number of nodes that this rank owns
+    surface : contact of surfaces; None without it
     """
 
     def __init__(
@@ -54,7 +57,7 @@ class StepContact:
         return total + (self.surface.change(q, base) if self.surface else 0.0)
 
     def change_of_friction(self, q: Positions, base: Positions) -> float:
-        """Return the change [J] of the energy of the obstacles' friction from base to q."""
+        """Return the change [J] of the obstacles' friction energy from base to q."""
         return sum(state.friction.change(q, base) for state in self.states if state.friction)
 
     def at(self, q: Positions) -> "StepContactAt":
@@ -62,7 +65,7 @@ class StepContact:
         return StepContactAt(self, q, [state.pressed(q[: self.owned]) for state in self.states])
 
     def friction_limits(self, q: Positions) -> Floats:
-        """Return the sum of mu N [N] that this rank's friction uses, and its value at q, (2,)."""
+        """Return this rank's sums of mu N [N], (2,): as the step's friction uses it, and at q."""
         of_nodes = sum(
             (state.friction_limits(q[: self.owned]) for state in self.states), np.zeros(2)
         )
@@ -78,7 +81,8 @@ class StepContact:
     def no_duals(self) -> Duals:
         """Return the duals for which ``hessian`` has the secant of the obstacles' friction.
 
-        The matrix A needs the secant: the true Hessian is zero along a slip, so nodes oscillate.
+        Methods with the matrix A need the secant. The true Hessian is zero along a slip, so nodes
+        would oscillate.
         """
         return [
             *(state.friction.no_duals() if state.friction else None for state in self.states),
@@ -108,7 +112,7 @@ class StepContactAt:
 
     @property
     def surface(self) -> SurfaceContact | None:
-        """Self-contact of the scene; None if it has none."""
+        """Contact of surfaces; None without it."""
         return self.contact.surface
 
     @property
@@ -132,10 +136,9 @@ class StepContactAt:
             self.surface.add_gradient(self.q, gradient)
 
     def stopped(self, end: Positions) -> Positions | None:
-        """Return positions with the nodes that enter obstacles on the path to ``end`` stopped.
+        """Return ``end`` with the nodes that enter obstacles on the path stopped; None if none do.
 
-        They stop at a small depth, where the Hessian has the contact. Return None without such
-        nodes.
+        The nodes stop at a small depth, so that the Hessian includes their contact.
 
         end : (owned or more, 3) [m]
         """
@@ -168,7 +171,7 @@ class StepContactAt:
     def bound(self) -> Floats:
         """Return an upper bound (owned,) [N/m] of each node's block.
 
-        It is constant while the set of nodes in contact is.
+        The obstacles' part changes only with the set of nodes in contact, the surface's seldom.
         """
         bound = np.zeros(self.contact.owned, like=self.q)
         for state, (rows, _, _) in self.of_obstacles:
@@ -178,9 +181,9 @@ class StepContactAt:
         return bound + self.surface.bound(self.q) if self.surface else bound
 
     def power(self, begin: float, end: float) -> float:
-        """Return the power [W] of the penalties on this rank's nodes.
+        """Return the power [W] that moving obstacles' penalties put into this rank's nodes.
 
-        begin, end : the substep [s] that gives an obstacle's velocity
+        begin, end : times [s] of the substep, which gives an obstacle's velocity
         """
         power = 0.0
         for state, (_, depth, normal) in self.of_obstacles:
@@ -193,7 +196,7 @@ class StepContactAt:
     def apply_friction(self, nodes: Movers, duration: float, begin: float, end: float) -> None:
         """Apply the obstacles' friction for a ``duration`` [s] to this rank's nodes.
 
-        begin, end : the substep [s] that gives an obstacle's velocity
+        begin, end : times [s] of the substep, which gives an obstacle's velocity
         """
         for state, pressed in self.of_obstacles:
             p = state.penalty

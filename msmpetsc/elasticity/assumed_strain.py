@@ -32,18 +32,18 @@ that are about to fold.
 - The quartic term is convex, and its Hessian at rest is 0. The projected Hessian leaves it out.
 - At rest W is at most mu V <|G|^2> (1 + 3 beta / 2) if d_x, d_y and d_z are not correlated. The
   general bound is in lattice.cell_moments.bounding_laplacians.
-- Q depends on C alone. Its form on the nine a (3 by axis, 3 by mode) is K.
+- Q depends on C alone. K is its quadratic form in the nine a (3 axes, 3 modes).
 
 With r_I = sum over m of (K a)_I,m p_m, the gradient of Q / 2 has the parts
 
     dQ/dp_m = sum over I of (K a)_I,m n_I,        dQ/df_I = c r_I - b (f_I . r_I) f_I           (5)
 
 with c = (1 + D) / (D + |f_I|^2) and b = 2 c^2 / (1 + D). If f_I changes by g, its direction changes
-by c g - b (f_I . g) f_I, of a norm of at most c |g|. The projected Hessian keeps the directions: it
-is the form K of the changes n_I . dp. So the state of a projected Hessian needs no p.
+by c g - b (f_I . g) f_I, whose norm is at most c |g|. The projected Hessian keeps the directions
+fixed: it is the form K of the changes n_I . dp. So the state of a projected Hessian needs no p.
 
-Lengths: the modes h of a strain are 2 h^2 p, h the side of a cell, and slopes are 4 h times F. So
-with the modes in a state divided by 4 h, all products are in units of slopes.
+Units: with the side h of a cell, the modes of a strain are 2 h^2 p and its slopes are 4 h F. A
+state stores modes divided by 4 h, so that all products are in units of slopes.
 """
 
 import math
@@ -74,7 +74,7 @@ NineVectors: TypeAlias = tuple[Three, Three, Three]
 
 
 def _single(number: float) -> float:
-    """Return a number of single precision, so that products of single precision keep it."""
+    """Return a number in single precision, so that products with single numbers stay single."""
     return np.float32(number)  # type: ignore[return-value]
 
 
@@ -86,25 +86,25 @@ RANGE = _single(1.5)
 # 2 s / (1 - s) [-]; with it a wall of a tenth of a cell bends 15 to 20% too little. A
 # power of 2 is exact in single precision.
 FULL = _single(1 / 256)
-# 1 - s [-], the factor of C in a cell's constants
+# 1 - s [-]; the factor of C in a cell's constants
 ASSUMED = 2 / (2 + float(FULL))
 # kappa [-] of Eq. 4; with it bars twisted by 720 degrees untwist when let go, and a
 # cell bent to strains of 0.1 is stiffer by 1.5%
 HARDENING = _single(2.0)
-# keeps divisors from zero [-]
+# smallest number to add to divisors that may be zero [-]
 LEAST = _single(1e-30)
 
 
 @njit(inline="always")
 def modes_of(e: Strains) -> Three:
-    """Return the modes XY, XZ and YZ of a strain."""
+    """Return the modes XY, XZ and YZ of strains, a vector for each mode."""
     x, y, z = e
     return (x[3], y[3], z[3]), (x[4], y[4], z[4]), (x[5], y[5], z[5])
 
 
 @njit(inline="always")
 def slopes_of(e: Strains) -> Three:
-    """Return the mean slopes along each axis of a strain, 4 h times the columns of F."""
+    """Return the mean slopes of strains, a vector for each axis: 4 h times the columns of F."""
     x, y, z = e
     return (x[0], y[0], z[0]), (x[1], y[1], z[1]), (x[2], y[2], z[2])
 
@@ -119,7 +119,7 @@ def _factor(f: Vector) -> float:
 
 @njit(inline="always")
 def factors(f: Three) -> Vector:
-    """Return c of each column: the length of its direction (Eq. 1) over its own."""
+    """Return c of each column: the length of its direction (Eq. 1) over the column's length."""
     return _factor(f[0]), _factor(f[1]), _factor(f[2])
 
 
@@ -131,7 +131,7 @@ def directions(f: Three, c: Vector) -> Three:
 
 @njit(inline="always")
 def _lag(c: float) -> float:
-    """Return b of Eq. 5, by which a direction grows less than its column does."""
+    """Return b of Eq. 5: a direction grows more slowly than its column."""
     return c * (c + c) / RANGE
 
 
@@ -177,7 +177,7 @@ def rest_constants(c: Floats, k: int) -> Eight:
 
     c, k : constants of the cell, from index k on
     """
-    # A cell without stiffness must not divide by zero
+    # Avoid a division by zero in a cell without stiffness
     m, lame = c[k + 104], c[k + 112]
     beta = (lame + lame) / (lame + m + m + LEAST)
     return (
@@ -187,7 +187,7 @@ def rest_constants(c: Floats, k: int) -> Eight:
 
 @njit(inline="always")
 def tensions(c: Eight, a: Three) -> Three:
-    """Return K a, for each axis the parts of XY, XZ and YZ."""
+    """Return K a: for each axis, its parts for the modes XY, XZ and YZ."""
     xx, yy, zz, yz, xz, xy, _, beta = c
     x, y, z = a
     # The sum of the e_I is d . s
@@ -195,7 +195,7 @@ def tensions(c: Eight, a: Three) -> Three:
     tx = beta * (xx * sx + xy * sy + xz * sz)
     ty = beta * (xy * sx + yy * sy + yz * sz)
     tz = beta * (xz * sx + yz * sy + zz * sz)
-    # C_xx g_yz and so on
+    # C_xx g_yz, C_yy g_xz and C_zz g_xy
     gx, gy, gz = xx * (y[1] + z[0]), yy * (x[2] + z[0]), zz * (x[2] + y[1])
     own_x = yy * x[0] + yz * x[1], yz * x[0] + zz * x[1]
     own_y = xx * y[0] + xz * y[2], xz * y[0] + zz * y[2]
@@ -209,7 +209,7 @@ def tensions(c: Eight, a: Three) -> Three:
 
 @njit(inline="always")
 def full_forces(c: Eight, e: Seven) -> Four:
-    """Return the derivative of the last two terms of W by the modes (4,) of a component."""
+    """Return the derivatives of the last two terms of W by a component's four modes."""
     xx, yy, zz, yz, xz, xy, xyz, _ = c
     return (
         FULL * ((xx + yy) * e[3] + yz * e[4] + xz * e[5]),
@@ -227,7 +227,7 @@ def _hardening(c: Eight) -> float:
 
 @njit(inline="always")
 def _with_full(c: Eight, e: Strains, forces: Three) -> Modes:
-    """Return the derivative of W by the modes, from the forces of Q on XY, XZ and YZ."""
+    """Return the derivative of W by all modes, from the derivative of Q by XY, XZ and YZ."""
     x, y, z = full_forces(c, e[0]), full_forces(c, e[1]), full_forces(c, e[2])
     xy, xz, yz = forces
     return (
@@ -242,10 +242,11 @@ def _with_full(c: Eight, e: Strains, forces: Three) -> Modes:
 
 @njit(inline="always")
 def rest_gradient(c: Eight, f: Three, e: Strains, inverse_h4: float) -> tuple[Three, Modes]:
-    """Return the gradient of W (Eq. 5) by 4 h times the slopes, and by the modes (3 x 4).
+    """Return the derivatives of W (Eq. 5) by 4 h times the columns of F, and by the modes (3 x 4).
 
-    f : columns of F
-    e : strains of positions; ``inverse_h4`` is 1 / (4 h)
+    f          : columns of F
+    e          : strains of positions
+    inverse_h4 : 1 / (4 h)
     """
     p, factor = modes_of(e), factors(f)
     n = directions(f, factor)
@@ -258,7 +259,7 @@ def rest_gradient(c: Eight, f: Three, e: Strains, inverse_h4: float) -> tuple[Th
 
 @njit(inline="always")
 def rest_product(c: Eight, f: Three, p: Three, e: Strains) -> tuple[Three, Modes]:
-    """Return the product of the Hessian of W with a displacement, as ``rest_gradient`` does.
+    """Return the product of the Hessian of W with a displacement, in the form of ``rest_gradient``.
 
     f : columns of F
     p : modes of positions over 4 h
@@ -281,7 +282,13 @@ def rest_product(c: Eight, f: Three, p: Three, e: Strains) -> tuple[Three, Modes
 
 @njit(inline="always")
 def projected_modes(c: Eight, f: Three, e: Strains) -> Modes:
-    """Return the product of the projected Hessian of W: its directions do not change."""
+    """Return the modes (3 x 4) of the product of W's projected Hessian with a displacement.
+
+    The directions are fixed, so the product has no slopes.
+
+    f : columns of F
+    e : strains of the displacement
+    """
     n = directions(f, factors(f))
     t = tensions(c, products(n, modes_of(e)))
     return _with_full(c, e, each(transposed(t), n))
@@ -289,7 +296,7 @@ def projected_modes(c: Eight, f: Three, e: Strains) -> Modes:
 
 @njit(inline="always")
 def _change_of_direction(f: Vector, g: Vector) -> Vector:
-    """Return the change of a direction as its column f changes by g, with the digits of g.
+    """Return the change of a direction as its column f changes by g, accurate for a small g.
 
     n' - n = c' g + (c' - c) f,    c' - c = -c c' / (1 + D) g . (f + f').
     """
@@ -301,7 +308,7 @@ def _change_of_direction(f: Vector, g: Vector) -> Vector:
 
 @njit(inline="always")
 def rest_change(c: Eight, f: Three, g: Three, e: Strains, d: Strains, inverse_h4: float) -> float:
-    """Return the change of W, with its digits, as the columns f change by g and strains e by d.
+    """Return the change of W as columns f change by g and strains e by d, accurate for small d.
 
     Q(a') - Q(a) = (a' - a) . K (a' + a), and likewise for the other squares.
     """
@@ -331,7 +338,7 @@ def rest_change(c: Eight, f: Three, g: Three, e: Strains, d: Strains, inverse_h4
 
 @njit(inline="always")
 def corner_tensions(c: Eight, f: Three, g: Seven) -> NineVectors:
-    """Return the tensions by a corner's displacement v, for fixed directions.
+    """Return the tensions that a corner's displacement v causes, with directions fixed.
 
     Entry [I][m] of the result is a vector y (3,): the tension (K a)_I,m is y . v.
 
@@ -361,11 +368,11 @@ def rest_concavity(
     left: float,
     spectrum: tuple[float, float],
 ) -> tuple[float, float]:
-    """Return a, b >= 0: the Hessian of W, and ``left`` |G|^2, are at least -a |G|^2 - b |h|^2.
+    """Return a, b >= 0: the Hessian of W plus ``left`` |G|^2 is at least -a |G|^2 - b |h|^2.
 
-    G are the slopes of a displacement, h its modes, and m the change of the directions. In units
-    of slopes the form is K(n . h + m . p) + 2 (K a) (m . h), and a term of the change of m. Three
-    bounds hold, with c the greatest of the columns':
+    G are the slopes of a displacement, h its modes, and m the change of the directions. In units of
+    slopes the Hessian's form is K(n . h + m . p) + 2 (K a) (m . h), plus a term from the change of
+    m. Three bounds hold, with c the greatest factor of a column:
 
     - 2 (K a)(m . h) <= 2 c |K a| |G| |h|
     - K(x + y) >= K(x) / 2 - K(y); K lies between its least and its greatest eigenvalue

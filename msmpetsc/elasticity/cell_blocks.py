@@ -14,15 +14,15 @@ from msmpetsc.elasticity.springs import rows_of
 from msmpetsc.lattice.cell_moments import FORM
 from msmpetsc.lattice.lattice import Lattice
 
-# constants of a cell [-]: its form (lattice.cell_moments), whose entries for modes are
-# times m = mu V / (16 h^2) and, but for XYZ, times 1 - s (elasticity.assumed_strain);
-# then m and lambda V / (16 h^2)
+# number of a cell's constants [-]: its form (lattice.cell_moments), then m = mu V /
+# (16 h^2) and lambda V / (16 h^2). The form's entries for modes are multiplied by m
+# and, except for XYZ, by 1 - s (elasticity.assumed_strain).
 ROWS = FORM + 2
-# entries of a cell in a projected Hessian's state [-]: F by rows, then V U' and V U''
+# numbers of a cell in a projected Hessian's state [-]: F by rows, then V U' and V U''
 # over 16 h^2
 PROJECTED = 11
-# entries in a true Hessian's state [-]: then the modes XY, XZ and YZ over 4 h, of three
-# components each
+# numbers of a cell in a true Hessian's state [-]: as above, then the modes XY, XZ and
+# YZ over 4 h, with three components each
 STATE = 20
 # VTK's corner number at each place of the order with x fastest, then y [-]
 BY_AXIS = [0, 1, 3, 2, 4, 5, 7, 6]
@@ -31,11 +31,11 @@ BY_AXIS = [0, 1, 3, 2, 4, 5, 7, 6]
 class CellBlocks(NamedTuple):
     """A solid's cells in blocks of LANES; the blocks of cells that the rank owns come first.
 
-    The last owned block and the last of all are filled up with cells of zero stiffness.
+    Cells of zero stiffness fill up the last owned block and the last block of all.
 
     nodes     : (b, LANES, 8) local corner nodes, x fastest; unsigned, to save a test of their sign
     which     : (b,) row of ``constants`` for each block
-    constants : (k, ROWS * LANES) distinct rows of constants, LANES of each number
+    constants : (k, ROWS * LANES) distinct rows of constants, interleaved
     around    : (8, n) on a GPU the cell corners at each owned node, as indices into (b, 8, LANES),
                 filled up with an index past the end; (8, 0) on a CPU
     owned     : number of blocks of cells that the rank owns
@@ -57,9 +57,10 @@ class CellRows(NamedTuple):
 
     nodes     : (c, 8) local corner nodes, x fastest
     constants : ``CellBlocks.constants``, flat
-    by_node   : True on a CPU, where a corner adds to its node's row; on a GPU it has its own row
+    by_node   : True on a CPU, where a corner adds to its node's row; False on a GPU, where each
+                corner has its own row
     state     : (b, width, LANES) state of a Hessian, flat; empty if the kernel needs none
-    width     : entries of a cell in the state, PROJECTED or STATE
+    width     : numbers of a cell in the state, PROJECTED or STATE
     """
 
     nodes: Indices
@@ -84,13 +85,13 @@ def one_by_one(blocks: CellBlocks, state: Array | None = None) -> CellRows:
 def blocks_of(lattice: Lattice, constants: Rows, u: int) -> CellBlocks:
     """Return the lattice's cells with their constants (c, ROWS), on the device of its nodes.
 
-    Cells with equal constants share blocks, so that few distinct rows are stored.
+    Cells with equal constants are put into the same blocks, so that few distinct rows are stored.
     """
     cells = to_host(lattice.local_cells)[:, BY_AXIS]
     number = np.arange(len(constants))
     kinds = []
     _, alike, count = np.unique(whole_rows(constants), return_inverse=True, return_counts=True)
-    # Cells with constants too rare to fill a block keep their order, for locality.
+    # Cells whose constants are too rare to fill a block keep their order, for locality.
     rank = np.where(count[alike] < LANES, len(count), alike)
     for kind in (number < lattice.cells_owned, number >= lattice.cells_owned):
         own = np.flatnonzero(kind)
@@ -100,7 +101,7 @@ def blocks_of(lattice: Lattice, constants: Rows, u: int) -> CellBlocks:
     _, first, which = np.unique(whole_rows(rows), return_index=True, return_inverse=True)
     around = np.empty((8, 0), np.int64)
     if not on_host(lattice.nodes):
-        # Cells that only fill up a block have no stiffness. Their corners get no row.
+        # Cells without stiffness only fill up blocks. Their corners get no row.
         is_cell = rows.reshape(-1, ROWS, LANES)[:, -2] > 0
         corners = np.where(is_cell[:, None], nodes.transpose(0, 2, 1), lattice.owned)
         around = rows_of(corners.ravel().astype(np.int64), lattice.owned)
@@ -112,7 +113,7 @@ def blocks_of(lattice: Lattice, constants: Rows, u: int) -> CellBlocks:
 def _in_blocks(nodes: Indices, constants: Rows) -> tuple[Indices, Rows]:
     """Return the nodes (b, LANES, 8) and the constants (b, ROWS * LANES) of cells in blocks.
 
-    The last block is filled up with cells of zero stiffness.
+    Cells of zero stiffness fill up the last block.
     """
     lacking = -len(nodes) % LANES
     nodes = np.concatenate([nodes, np.repeat(nodes[-1:], lacking, axis=0)]).astype(np.uint32)

@@ -131,7 +131,7 @@ def add_gradient(blocks: CellBlocks, q: Positions, gradient: Rows) -> None:
     for b in range(len(blocks.nodes)):
         _gather(blocks.nodes, b, q, w)
         _load(blocks.constants, blocks.which[b], w, CONSTANTS)
-        # Only a number known to the compiler lets it vectorise the loop
+        # The compiler vectorises the loop only if the volumetric energy is a constant
         if blocks.u == QUADRATIC:
             _quadratic_gradient_lanes(w, blocks.h4)
         else:

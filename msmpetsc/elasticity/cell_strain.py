@@ -1,4 +1,4 @@
-"""Strain within a cell, and the corner forces of a stress: formulas that all loops share.
+"""Strain within a cell, and the forces at its corners: formulas that all loops share.
 
 The strain of a component is its three mean slopes and its four modes (lattice.cell_moments).
 Constants are interleaved for LANES cells: number i of the cell at k is c[k + LANES * i].
@@ -10,7 +10,7 @@ from msmpetsc.backend.arrays import Floats
 from msmpetsc.backend.kernel import njit
 from msmpetsc.elasticity.vectors import Three, Vector
 
-# cells of a block [-]; eight doubles fill the widest vector register
+# number of cells in a block [-]; eight doubles fill the widest vector register
 LANES = 8
 
 Four: TypeAlias = tuple[float, float, float, float]
@@ -31,7 +31,7 @@ def form_of(c: Floats, k: int) -> Six:
 
 @njit(inline="always")
 def strain(u: Eight, form: Six) -> Seven:
-    """Return the strain of corner values u (8,), x fastest: mean slopes times 4 h, then modes."""
+    """Return the strain of corner values u (8,), x fastest: 4 h times mean slopes, then modes."""
     a, b, c, d, e, f, g, h = u
     s0, d0, s1, d1, s2, d2, s3, d3 = a + b, b - a, c + d, d - c, e + f, f - e, g + h, h - g
     x0, y0, xy0, x1, y1, xy1 = d0 + d1, s1 - s0, d1 - d0, d2 + d3, s3 - s2, d3 - d2

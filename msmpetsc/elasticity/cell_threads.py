@@ -140,14 +140,14 @@ def _write_changes(
 def _add(
     kernel: Callable[..., None], array: Array, cells: CellRows, around: Indices, rows: Rows
 ) -> None:
-    """Run a kernel that writes three numbers per corner, and add them to the owned rows (l, 3)."""
+    """Run a kernel that writes three numbers per corner. Add these to the owned rows (l, 3)."""
     store = np.empty(24 * len(cells.nodes), like=rows)
     kernel(len(cells.nodes), array, cells, store)
     _add_around(around.shape[1], store, around, rows)
 
 
 def add_product(blocks: CellBlocks, state: Rows, v: Array, product: Array) -> None:
-    """Add (Hessian) v [N] to the owned rows of ``product`` (l, 3), from a ``linearise`` state."""
+    """Add (Hessian) v [N] to owned rows of ``product`` (l, 3), with the state of ``linearise``."""
     _add(_write_products, v, one_by_one(blocks, state), blocks.around, product)
 
 
@@ -157,7 +157,7 @@ def add_gradient(blocks: CellBlocks, q: Positions, gradient: Rows) -> None:
 
 
 def linearise(blocks: CellBlocks, q: Positions, projected: bool, state: Rows) -> None:
-    """Write the entries of each cell at q (l, 3) [m] into ``state`` (b, width * LANES).
+    """Write the state of each cell's Hessian at q (l, 3) [m] into ``state`` (b, width * LANES).
 
     The width is PROJECTED if the Hessian is ``projected``, else STATE (elasticity.cell_blocks).
     """

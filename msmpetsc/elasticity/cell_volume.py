@@ -1,6 +1,6 @@
 """Signed volumes that reveal inverted cells: the volumes at a cell's corners, and its mean J.
 
-The three edges at a corner span the corner's volume. Positions are local, (l, 3) [m].
+The three edges at a corner span the corner volume. Positions are local, (l, 3) [m].
 """
 
 import math
@@ -62,9 +62,10 @@ def _mean_volume_of(
 
 
 def volume_ratios(q: Positions, cells: Indices, forms: Rows, cell_size: float) -> Floats:
-    """Return J (c,) [-] of a solid's cells at q (l, 3) [m], of the mean deformation gradient.
+    """Return J = det F (c,) [-] of a solid's cells at q (l, 3) [m], with F the cell's mean.
 
-    cells, forms : (c, 8) corner nodes; (c, FORM) of lattice.cell_moments
+    cells : (c, 8) corner nodes
+    forms : (c, FORM) forms of the cells (lattice.cell_moments)
     """
     volumes: Floats = np.empty(len(cells), like=q)
     _mean_volume_of(len(cells), volumes, q, cells, forms)

@@ -16,9 +16,9 @@ class Elasticity:
     """Elastic energy E of this rank's part of a lattice, its gradient and its Hessian.
 
     The law is a neo-Hookean solid (elasticity.solid) or linear springs (elasticity.springs).
-    ``springs``, ``solid`` and ``viscosity`` are None if the law has no such part. If the solid is
-    viscous, E includes the dissipation potential D of the step that ``viscosity`` began last. It
-    includes the potential of ``pressures``, which are 0 until a step sets their values.
+    ``springs``, ``solid``, ``viscosity`` and ``pressures`` are None if E has no such part. If the
+    solid is viscous, E includes the dissipation potential D of the step that ``viscosity`` began
+    last. E also includes the potential of pressures, which are 0 until a step sets their values.
 
     Positions are local (l, 3) [m]. Energies are sums over the springs or cells that this rank owns.
     Gradients and products are complete in the owned rows.
@@ -41,7 +41,7 @@ class Elasticity:
         self.parts = [part for part in laws if part]
 
     def energy(self, q: Positions) -> float:
-        """Return this rank's part of E [J]: the energy change from rest, where E is 0, and D."""
+        """Return this rank's part of E [J]: the change from the rest state, plus D."""
         viscous = self.viscosity.energy(q) if self.viscosity else 0.0
         laws = self.solid, self.springs, self.pressures
         return viscous + sum(law.change(q, self.rest) for law in laws if law)
@@ -62,16 +62,16 @@ class Elasticity:
 
     @property
     def bound(self) -> float | None:
-        """Factor c [-] for which c D, D of ``add_bound``, bounds the projected Hessian.
+        """Factor c [-]: c D bounds the projected Hessian, with D of ``add_bound``.
 
-        It is None if it must be measured.
+        It is None for a solid, for which c must be measured.
         """
         return None if self.solid else 2.0
 
     def concavity(self, q: Positions) -> Floats:
         """Return a diagonal C >= 0 (owned,) [N/m]: Hessian + C is positive semidefinite at q.
 
-        C is 0 at a node without compressed springs or, for a solid, without strained cells.
+        C is 0 at a node without compressed springs, strained cells of a solid, or pressure.
         """
         concavity = np.zeros(len(q), like=q)
         law = self.solid or self.springs
@@ -86,7 +86,7 @@ class Elasticity:
     ) -> "Hessian":
         """Return the Hessian of E at q (l, 3) [m].
 
-        projected : without its negative parts, so that it is positive semidefinite
+        projected : leave out negative parts, so that the Hessian is positive semidefinite
         dtype     : type of the stored numbers
         """
         return Hessian([part.hessian_at(q, projected, dtype) for part in self.parts])
@@ -94,9 +94,9 @@ class Elasticity:
     def add_bound(self, q: Positions, blocks: Rows) -> None:
         """Add a block diagonal D to the owned rows of ``blocks`` (l, 9) [N/m].
 
-        The projected Hessian at q is at most ``bound`` D. A semidefinite form of n nodes is at most
-        n times its block diagonal: n = 2 for a spring, and 8 for a cell, whose factor is usually
-        less.
+        The projected Hessian at q is at most ``bound`` times D. A semidefinite form of n nodes is
+        at most n times its block diagonal, with n = 2 for a spring. For a cell n = 8, but the
+        factor is usually less.
         """
         for part in self.parts:
             part.add_bound(q, blocks)
@@ -104,7 +104,7 @@ class Elasticity:
 
 @dataclass(frozen=True)
 class Hessian:
-    """Hessian of E at a position, ready for many products."""
+    """Hessian of E at given positions, as the sum of its parts."""
 
     parts: list[Product]
 

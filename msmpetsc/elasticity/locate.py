@@ -13,7 +13,7 @@ def node_of_greatest(comm: MPI.Comm, lattice: Lattice, rows: Indices, measure: F
     """Return a description of the node at which a measure is greatest or NaN (collective).
 
     rows    : (k,) local nodes
-    measure : (k,) the measure at each
+    measure : (k,) the measure at each node
     """
     number, where = _least(
         comm, lattice, rows[:, None], -np.nan_to_num(to_host(measure), nan=np.inf)
@@ -24,7 +24,8 @@ def node_of_greatest(comm: MPI.Comm, lattice: Lattice, rows: Indices, measure: F
 def _least(comm: MPI.Comm, lattice: Lattice, corners: Indices, measure: Floats) -> tuple[int, str]:
     """Return the global node number and the place at which a measure (k,) is least (collective).
 
-    corners : (k, c) local nodes of each item measured; its place is their mean, its node the first
+    corners : (k, c) local nodes of each measured item. The item's node is the first of these, its
+              place their mean at rest.
     """
     candidate = np.inf, 0, np.zeros(3)
     if len(corners):
@@ -45,8 +46,8 @@ def worst_inverted(
     """Return the number of inverted cells at q (l, 3) [m] and the place of the worst (collective).
 
     The place is "" if no cell is inverted. A solid's cell is inverted if its mean J, over the part
-    inside the surface, is <= 0: corners outside of the surface may fold. With ``corners`` it counts
-    if any of its corner volumes is <= 0, like a cell of springs.
+    inside the surface, is <= 0: corners outside the surface may fold. A cell of springs, or any
+    cell if ``corners``, is inverted if one of its corner volumes is <= 0.
     """
     cells, solid = lattice.local_cells[: lattice.cells_owned], lattice.solid
     if solid is None or corners:

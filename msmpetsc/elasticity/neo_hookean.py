@@ -15,7 +15,7 @@ within the cell (elasticity.assumed_strain). The volumetric energy u is
 
 - L in A = M + t^2 L is 2 mu + 3 lambda times the integral of |grad x|^2, or more
   (lattice.cell_moments.bounding_laplacians): A dominates the Hessian.
-- U'' > 0, but for ``log`` above J = e^(1 + mu / lambda). So an inverted cell is pushed back.
+- U'' > 0, except for ``log`` above J = e^(1 + mu / lambda). So an inverted cell is pushed back.
 - The second variation at rest is not negative, however the cell is cut. For a mean slope G
   it is ``2 mu |sym G|^2 + lambda (tr G)^2`` plus the squares of W.
 
@@ -27,14 +27,14 @@ splits into blocks:
 - a 3 x 3 block: sum (mu s_i^2 - U' J) y_i^2 + (U'' J^2 + U' J) (sum y_i)^2 with y_i = x_i / s_i.
   It is not negative if U' < 0, J >= 1/2 and U'' >= 0, for each u.
 
-For all other F the term of U' is at most |U'| R |F| in norm, with R^2 = 4/3. The reason is that
-its 3 x 3 block is symmetric and has no trace and, over U', the Frobenius norm sqrt(2) |F|. The
-projected Hessian limits |U'| so that mu outweighs this term, and raises negative U'' to zero. If
-U' < 0 and J >= J_0, the limit for the 2 x 2 blocks suffices for the 3 x 3 block, too.
+For all other F the term of U' is at most |U'| R |F| in norm, with R^2 = 4/3. The reason: its 3 x 3
+block is symmetric and traceless and has the Frobenius norm sqrt(2) |U'| |F|. The projected Hessian
+limits |U'| so that mu outweighs this term, and raises negative U'' to zero. If U' < 0 and
+J >= J_0, the limit for the 2 x 2 blocks suffices for the 3 x 3 block, too.
 
 The loops of a CPU (elasticity.cell_lanes) and of a GPU (elasticity.cell_threads) share these
-formulas. A Hessian stores F, V U' and V U'' of each cell, and its modes unless it is projected.
-A cell's constants are scaled with V.
+formulas. A Hessian stores F, V U' and V U'' of each cell. Unless it is projected, it also stores
+the cell's modes. A cell's constants are scaled with V.
 """
 
 import math
@@ -65,14 +65,14 @@ from msmpetsc.elasticity.vectors import (
 # Names of the volumetric energies u; kernels have their numbers
 VOLUMETRIC = ("quadratic", "log", "simo")
 QUADRATIC, LOG, SIMO = range(len(VOLUMETRIC))
-# J_0 [-]; U is a parabola below, so that the force on an inverted cell stays finite
+# J_0 [-]; below it U is a parabola, so that the force on an inverted cell stays finite
 ONSET = 0.2
-# least J [-] from which U' < 0 keeps the 3 x 3 block of the true Hessian semidefinite;
-# see above
+# least J at which, with U' < 0, the 3 x 3 block of the true Hessian is semidefinite
+# [-]; see above
 CONVEX = 0.5
-# R, bound of the norm of G -> F x G by |F| [-]; see above
+# R, bound of the norm of the map from G to F x G over |F| [-]; see above
 NORM = math.sqrt(4 / 3)
-# iterations towards a cell's rotation [-]; far from it each halves the largest stretch
+# iterations for a cell's rotation [-]; each halves the largest stretch if it is large
 ROTATION_ITERATIONS = 30
 
 
@@ -89,7 +89,7 @@ def _volumetric_slopes(j: float, u: int) -> tuple[float, float]:
 
 @njit(inline="always")
 def _volumetric_change(j: float, before: float, change: float, u: int) -> float:
-    """Return u(j) - u(before) with the digits of ``change`` = j - before."""
+    """Return u(j) - u(before), accurate for a small ``change`` = j - before."""
     if u == QUADRATIC:
         return 0.5 * change * (j + before - 2.0)
     growth = math.log1p(change / before)
@@ -122,7 +122,7 @@ def volume_energy(j: float, mu: float, lame: float, u: int) -> float:
 
 @njit(inline="always")
 def volume_change(j: float, before: float, change: float, mu: float, lame: float, u: int) -> float:
-    """Return U(j) - U(before) [Pa] with the digits of ``change`` = j - before."""
+    """Return U(j) - U(before) [Pa], accurate for a small ``change`` = j - before."""
     if j >= ONSET and before >= ONSET:
         change_of_u = _volumetric_change(j, before, change, u)
         return lame * change_of_u - mu * math.log1p(change / before)
@@ -137,7 +137,7 @@ def _coupling_bound(f: Three, j: float, slope: float, least: float) -> float:
     """Return a bound c: the term of U' lowers the eigenvalues of the Hessian by at most c |U'|.
 
     If U' < 0 and J >= ``least``, the 3 x 3 block needs no bound. Then c is Gershgorin's bound of
-    the largest singular value of F, exact in a rotation. Otherwise c is R |F|.
+    the largest singular value of F, which is exact for a rotation. Otherwise c is R |F|.
     """
     x, y, z = f
     xx, yy, zz = dot(x, x), dot(y, y), dot(z, z)
@@ -174,7 +174,7 @@ def kept_modes(state: Floats, s: int) -> Three:
 
 @njit(inline="always")
 def slope_product(e: Strains, m: float, state: Floats, s: int) -> Three:
-    """Return the product of the Hessian of E with a displacement, by the mean slopes.
+    """Return the slopes of the product of the Hessian of E - W with a displacement.
 
     e        : strains of the displacement
     m        : V mu / (16 h^2)
@@ -191,9 +191,10 @@ def slope_product(e: Strains, m: float, state: Floats, s: int) -> Three:
 def cell_gradient(
     rest: Eight, m: float, lame: float, e: Strains, h4: float, u: int
 ) -> tuple[Three, Modes]:
-    """Return the gradient of E by 4 h times the mean slopes and by the modes (3 x 4).
+    """Return the derivatives of E by 4 h times the columns of F, and by the modes (3 x 4).
 
-    The constants are not in an array, because numba would then not vectorise loops over cells.
+    The constants are numbers, not an array, because numba would not vectorise loops over cells
+    with an array.
 
     rest    : ``rest_constants``
     m, lame : V mu and V lambda over 16 h^2
@@ -212,9 +213,9 @@ def cell_gradient(
 def cell_product(c: Floats, k: int, state: Floats, s: int, e: Strains) -> tuple[Three, Modes]:
     """Return the product of the Hessian of E with a displacement of strains e.
 
-    It is the derivative of ``cell_gradient``.
+    The product is the derivative of ``cell_gradient``.
 
-    state, s : entries of ``write_state``, from index s on
+    state, s : entries of ``write_state`` and ``write_modes``, from index s on
     """
     slopes = slope_product(e, c[k + 104], state, s)
     f, p = kept_gradient(state, s), kept_modes(state, s)
@@ -224,7 +225,7 @@ def cell_product(c: Floats, k: int, state: Floats, s: int, e: Strains) -> tuple[
 
 @njit(inline="always")
 def projected_product(c: Floats, k: int, state: Floats, s: int, e: Strains) -> tuple[Three, Modes]:
-    """Return ``cell_product`` of a state without modes."""
+    """Return the product of the projected Hessian of E with a displacement of strains e."""
     slopes = slope_product(e, c[k + 104], state, s)
     return slopes, projected_modes(rest_constants(c, k), kept_gradient(state, s), e)
 
@@ -233,7 +234,7 @@ def projected_product(c: Floats, k: int, state: Floats, s: int, e: Strains) -> t
 def forms_change(
     c: Floats, k: int, d: Three, base: Strains, moved: Strains, inverse_h4: float
 ) -> float:
-    """Return the change of E without U as F changes by d and the strains by ``moved``."""
+    """Return the change of E without U, as F changes by d and the strains ``base`` by ``moved``."""
     g, f = slopes_of(moved), gradient_of(base, inverse_h4)
     own: float = c[k + 104] * (inner(slopes_of(base), g) + 0.5 * inner(g, g))
     return own + rest_change(rest_constants(c, k), f, d, base, moved, inverse_h4)
@@ -241,7 +242,7 @@ def forms_change(
 
 @njit(inline="always")
 def write_state(store: Floats, s: int, f: Three, slope: float, curvature: float) -> None:
-    """Write F by rows, V U' and V U'' of a cell into ``store`` from index s, for its Hessian."""
+    """Write F by rows, V U' and V U'' of a cell into ``store``, from index s on."""
     x, y, z = f
     store[s], store[s + 8], store[s + 16] = x[0], y[0], z[0]
     store[s + 24], store[s + 32], store[s + 40] = x[1], y[1], z[1]
@@ -251,7 +252,7 @@ def write_state(store: Floats, s: int, f: Three, slope: float, curvature: float)
 
 @njit(inline="always")
 def write_modes(store: Floats, s: int, e: Strains, inverse_h4: float) -> None:
-    """Write the modes over 4 h of the strains e of positions into ``store``, from index s + 88."""
+    """Write the modes of strains e over 4 h into ``store``, from index s + 88 on."""
     for i in range(3):
         store[s + 88 + 8 * i] = inverse_h4 * e[i][3]
         store[s + 112 + 8 * i] = inverse_h4 * e[i][4]
@@ -260,9 +261,9 @@ def write_modes(store: Floats, s: int, e: Strains, inverse_h4: float) -> None:
 
 @njit(inline="always")
 def slopes_at(f: Three, mu: float, lame: float, u: int, projected: bool) -> tuple[float, float]:
-    """Return U' and U'' at F.
+    """Return U' and U'' at F, in the unit of mu.
 
-    If ``projected``, U'' is not negative, and |U'| is limited so that mu outweighs it.
+    If ``projected``, U'' is not negative, and |U'| is limited so that mu outweighs its term.
     """
     j = dot(f[0], cofactors(f)[0])
     slope, curvature = _slopes(j, mu, lame, u)
@@ -279,8 +280,8 @@ def concavity_bounds(
 ) -> tuple[float, float]:
     """Return a, b >= 0: the Hessian's form is at least -a |G|^2 - b |h|^2.
 
-    G are the slopes of a displacement, and h its modes XY, XZ and YZ. mu outweighs a part of the
-    terms of U' and of W (elasticity.assumed_strain).
+    G are the slopes of a displacement, and h its modes XY, XZ and YZ. The bound uses that mu
+    outweighs a part of the terms of U' and W (elasticity.assumed_strain).
 
     e        : strains of positions
     spectrum : least and greatest eigenvalue of C
@@ -298,9 +299,10 @@ def concavity_bounds(
 
 @njit(inline="always")
 def rotation_of(f: Three) -> tuple[Three, bool]:
-    """Return the rotation R of the polar decomposition F = R S, and whether it was computed.
+    """Return the rotation R of the polar decomposition F = R S, and whether it exists.
 
-    Newton's iteration is R <- (R + R^-T) / 2 (Higham 1986). If J <= J_0, R is the identity.
+    Newton's iteration is R <- (R + R^-T) / 2 (Higham 1986). If J <= J_0, return the identity and
+    False.
     """
     if not dot(f[0], cofactors(f)[0]) > ONSET:
         return ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), False
@@ -312,7 +314,7 @@ def rotation_of(f: Three) -> tuple[Three, bool]:
 
 @njit(inline="always")
 def determinant_and_change(d: Three, f: Three) -> tuple[float, float]:
-    """Return det F and the change of it, det(F + D) - det F, with the digits of a small D.
+    """Return det F and its change det(F + D) - det F, accurate for a small D.
 
     The change is cof F : D + F : cof D + det D.
     """

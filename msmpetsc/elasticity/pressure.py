@@ -1,10 +1,10 @@
 """Pressure p on surfaces that the lattice carries: a potential p V, and its derivatives.
 
 A triangle (a, b, c) has the force -p (b - a) x (c - a) / 6 at each corner: the uniform pressure on
-the linear triangle, at its present position. On a closed surface the forces are -p grad V. V is the
-volume that the surface bounds, positive if the normals point out of it. So the resultant is zero,
-and the Hessian p grad grad V is symmetric. V is cubic along a straight path, so that Simpson's rule
-for its derivative gives its change exactly.
+the linear triangle, at its present position. On a closed surface the forces are -p grad V, with V
+the volume inside, positive if the normals point outwards. So the resultant is zero, and the Hessian
+p grad grad V is symmetric. V is cubic along a straight path, so Simpson's rule, applied to the
+derivative of V, gives the change of V exactly.
 """
 
 from collections.abc import Iterator, Sequence
@@ -20,7 +20,7 @@ class Pressures:
     """The potential of pressures, with the methods that Elasticity needs of a law (collective).
 
     parts  : surfaces under pressure
-    values : pressure on each [Pa]; 0 until it is set
+    values : pressure on each surface [Pa]; 0 until a step sets it
     """
 
     def __init__(self, parts: Sequence[SurfacePart], values: Sequence[float] = ()):
@@ -44,7 +44,7 @@ class Pressures:
     def hessian_at(
         self, q: Positions, projected: bool, dtype: type = np.float64
     ) -> "PressureHessian":
-        """Return p grad grad V at q; zero if ``projected``: it is indefinite."""
+        """Return p grad grad V at q, or zero if ``projected``, because it is indefinite."""
         acting = [] if projected else self._acting()
         return PressureHessian([(part, pressure, part(q)) for part, pressure in acting])
 
@@ -61,7 +61,7 @@ class Pressures:
             _add(part, abs(pressure) / 12 * rows[:, :, None], concavity[:, None])
 
     def add_bound(self, q: Positions, blocks: Rows) -> None:
-        """Add nothing: multigrid leaves pressure out."""
+        """Add nothing, because multigrid leaves pressure out."""
 
     def resultants(self, q: Positions) -> Rows:
         """Return the force (p, 3) [N] of each pressure on this rank's triangles at q (l, 3) [m]."""
@@ -79,7 +79,7 @@ class PressureHessian:
 
     A call adds the product with v (l, 3) [N] to the owned rows of ``product`` (l, 3).
 
-    acting : each surface, its pressure [Pa] and the corners (3, f, 3) [m] of its triangles
+    acting : for each surface its pressure [Pa] and the corners (3, f, 3) [m] of its triangles
     """
 
     acting: list[tuple[SurfacePart, float, Rows]]
@@ -109,6 +109,9 @@ def _turned(corners: Rows, moves: Rows, pressure: float) -> Rows:
 
 
 def _add(part: SurfacePart, forces: Rows, rows: Rows) -> None:
-    """Add forces (f, k) on each corner, or (3, f, k), to the owned rows of ``rows`` (l, k)."""
+    """Add forces on corners to the owned rows of ``rows`` (l, k).
+
+    forces : (3, f, k) for each corner of the triangles, or (f, k) for all three corners
+    """
     of_nodes = part.to_nodes(forces)
     rows[: len(of_nodes)] += of_nodes

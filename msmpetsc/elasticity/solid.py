@@ -51,9 +51,9 @@ from msmpetsc.elasticity.vectors import Vector, cofactors, combined
 from msmpetsc.lattice.cell_moments import slopes_and_modes
 from msmpetsc.lattice.lattice import Lattice
 
-# constants of a cell for bounds of concavity [-]; see ``concavity_constants``
+# number of a cell's constants for bounds of concavity [-]; see ``concavity_constants``
 BOUNDS = 18
-# places of C by rows among a cell's constants [-]
+# indices of C, by rows, among a cell's constants [-]
 COVARIANCE = [6, 11, 10, 11, 7, 9, 10, 9, 8]
 
 
@@ -64,10 +64,12 @@ def _row_of(cells: CellRows, i: int, a: int) -> int:
 
 
 def concavity_constants(constants: Rows) -> Rows:
-    """Return what bounds of the Hessian's negative part need of cells with these constants.
+    """Return cells' constants (k, BOUNDS * LANES) for bounds of the Hessian's negative part.
 
-    They are the shares of the eight corners in |G|^2 and in |h|^2, then the least and the greatest
-    eigenvalue of C: a row (BOUNDS * LANES,) for each row of ``constants`` (k, ROWS * LANES).
+    A cell's constants are the shares of its eight corners in |G|^2 and in |h|^2, then the least and
+    the greatest eigenvalue of C.
+
+    constants : (k, ROWS * LANES) rows of ``CellBlocks.constants``
     """
     of_cells = constants.reshape(-1, ROWS, LANES).swapaxes(1, 2).reshape(-1, ROWS)
     slopes, modes = slopes_and_modes(of_cells[:, :6])
@@ -80,9 +82,9 @@ def concavity_constants(constants: Rows) -> Rows:
 
 
 def _shares(operators: Rows) -> Rows:
-    """Return numbers s (c, 8): |B v|^2 is at most the sum of s_a v_a^2.
+    """Return numbers s (c, 8) for which |B v|^2 is at most the sum of s_a v_a^2.
 
-    s_a = |b_a| times the norm of the sum of b_a b_a^T / |b_a|, with the columns b_a of B.
+    s_a is |b_a| times the norm of the sum of b_a b_a^T / |b_a|, with b_a the columns of B.
 
     operators : B (c, 3, 8)
     """
@@ -158,7 +160,7 @@ class CellHessians:
 
     @property
     def slopes(self) -> Array:
-        """V U' (b, LANES) of the cells, a view: the factor of the Hessian's term F x G."""
+        """V U' / (16 h^2) of the cells, (b, LANES), as a view: the factor of the term F x G."""
         return self.state[:, 9 * LANES : 10 * LANES]
 
     def add_diagonal(self, diagonal: Rows) -> None:
@@ -175,7 +177,7 @@ class CellHessians:
 
 @dataclass(frozen=True)
 class NeoHookean:
-    """A neo-Hookean solid: the cells around this rank's owned nodes."""
+    """A neo-Hookean solid: the cells around the nodes that this rank owns."""
 
     blocks: CellBlocks
 
@@ -199,7 +201,7 @@ class NeoHookean:
 
     @property
     def _moduli(self) -> tuple[Array, Array]:
-        """V mu and V lambda (k, LANES) over 16 h^2 of the cells' constants, as views."""
+        """V mu and V lambda over 16 h^2 among the cells' constants, (k, LANES) each, as views."""
         rows = self.blocks.constants.reshape(-1, ROWS, LANES)
         return rows[:, ROWS - 2], rows[:, ROWS - 1]
 
@@ -209,7 +211,7 @@ class NeoHookean:
 
     @property
     def stiffest(self) -> float:
-        """The greatest ratio lambda / mu of a cell [-]."""
+        """The greatest ratio lambda / mu of this rank's cells [-]."""
         mu, lame = self._moduli
         return float(greatest(lame / np.where(mu > 0, mu, 1.0)))
 
@@ -245,7 +247,7 @@ class NeoHookean:
         )
 
     def hessian_at(self, q: Positions, projected: bool, dtype: type = np.float64) -> CellHessians:
-        """Return the Hessian of E at q (l, 3) [m], ``projected`` to be positive semidefinite."""
+        """Return the Hessian of E at q (l, 3) [m]; positive semidefinite if ``projected``."""
         width = PROJECTED if projected else STATE
         state: Rows = np.empty((len(self.blocks.nodes), width * LANES), dtype, like=q)
         linearise(self.blocks, q, projected, state)

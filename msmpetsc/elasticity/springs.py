@@ -6,8 +6,8 @@ Positions are local, (l, 3) [m]: owned nodes first, then ghosts. A rank has ever
 owned nodes, so gradients and products are complete in the owned rows. The rows of ghosts are
 incomplete.
 
-``SpringScatter`` visits each spring once and adds to both ends: the faster loop on a CPU.
-``SpringGather`` runs a thread per node, which sums over the node's springs: the loop of a GPU. No
+``SpringScatter``, the faster loop on a CPU, visits each spring once and adds to both ends.
+``SpringGather``, the loop for a GPU, runs a thread per node that sums over the node's springs. No
 two threads write to the same row, so the sums are reproducible to the last bit. The gather loop
 stores no Hessian blocks, because positions take less memory traffic than the blocks of 26 springs.
 """
@@ -39,7 +39,7 @@ TINY = 1e-300
 def spring_change(before: Vector, d: Vector, r: float, k: float) -> float:
     """Return the change [J] of a spring's energy 1/2 k (|e| - r)^2 (Eq. 13), e = before + d.
 
-    Its change of length d . (e + before) / (|e| + |before|) keeps the digits of a small d.
+    The change of length, d . (e + before) / (|e| + |before|), is accurate for a small d.
     """
     e = before[0] + d[0], before[1] + d[1], before[2] + d[2]
     total = math.sqrt(dot(e, e)) + math.sqrt(dot(before, before))
@@ -59,7 +59,7 @@ def force_density(e: Vector, r: float, k: float) -> float:
 def spring_block(spring: Vector, r: float, k: float, projected: bool) -> Four:
     """Return c [N/m] and e [sqrt(N/m)] of a spring's Hessian c I + e e^T.
 
-    The eigenvalues are k along the spring and k (1 - r / l) across, with l the spring's length.
+    The eigenvalues are k along the spring and k (1 - r / l) across it, with l the spring's length.
     If ``projected``, the negative eigenvalue of a compressed spring is set to zero.
     """
     length = math.sqrt(max(dot(spring, spring), TINY))
@@ -98,7 +98,7 @@ class Springs(NamedTuple):
 def crushing_energy(lattice: Lattice) -> float:
     """Return the energy [J] that compresses every spring of this rank to zero length.
 
-    If the law is a solid, it is the energy of L that compresses every cell to a point.
+    For a solid, return the energy by the form of L that compresses every cell to a point.
     """
     if lattice.solid:
         return float(1.5 * lattice.solid.bounds[: lattice.cells_owned].sum())
@@ -109,7 +109,7 @@ def crushing_energy(lattice: Lattice) -> float:
 class Displacement(NamedTuple):
     """Positions ``base`` of nodes (l, 3) [m], and the displacement ``moved`` (l, 3) [m].
 
-    Energy changes are computed from ``moved``, because it keeps the digits of a small displacement.
+    Energy changes are computed from ``moved``, which keeps the digits of a small displacement.
     """
 
     base: Positions
@@ -225,7 +225,7 @@ def add_spring_concavity(q: Positions, springs: Springs, concavity: Floats) -> N
 def elastic_hessian(q: Positions, springs: Springs, projected: bool, blocks: Rows) -> None:
     """Write c and e of ``spring_block`` at q for each spring into ``blocks`` (s, 4).
 
-    projected : without negative eigenvalues, so that the Hessian is positive semidefinite
+    projected : leave out negative eigenvalues, so that the Hessian is positive semidefinite
     """
     ends, rest_length, stiffness = springs
     for s in range(len(ends)):
@@ -287,7 +287,7 @@ def add_block(block: Floats, c: float, factor: float, g: Vector) -> None:
 
 
 class Around(NamedTuple):
-    """The springs of each owned node, a column of the arrays per node.
+    """The springs of each owned node: the arrays have a column per node.
 
     neighbour : (w, owned) int32, local number of the node at the other end, -1 past the last spring
     kind      : (w, owned) u1, index of the rest length in ``lengths``
@@ -344,7 +344,7 @@ class SpringGather(OwnedSprings):
         self._sum_around(_concavity_around, concavity, q)
 
     def hessian_at(self, q: Positions, projected: bool, _: type = np.float64) -> Product:
-        """Return the product with the Hessian of E at q, for the owned rows. It stores q alone."""
+        """Return the product with the Hessian of E at q, for the owned rows. Only q is stored."""
         springs = AroundAt(self.around, q.copy(), projected)
         count = self.around.neighbour.shape[1]
         return lambda v, product: _product_around(count, product, springs, v)

@@ -5,10 +5,9 @@ The first Piola-Kirchhoff and the Cauchy stress are (Bonet and Wood 2008, chapte
 
     P = mu F + U' cof F,        sigma = P F^T / J = mu / J F F^T + U' I.
 
-The pressure is p = -tr(sigma) / 3, von Mises' stress is (3/2 |sigma + p I|^2)^(1/2). The stress at
-a node is the mean over the cells around it, weighted by their volume at rest. In nearly
-incompressible solids prefer the nodes' stress, because the cells' pressures may alternate from cell
-to cell.
+The pressure is p = -tr(sigma) / 3, and von Mises' stress is (3/2 |sigma + p I|^2)^(1/2). The stress
+at a node is the mean over the cells around the node, weighted by their volume at rest. In nearly
+incompressible solids prefer the stress at nodes, because pressure may alternate from cell to cell.
 """
 
 from typing import Any
@@ -32,7 +31,7 @@ class StressField:
     """The stress fields of a frame (fields.Frame), for this rank's part of a lattice.
 
     lanes  : (d,) index of each of the lattice's ``local_cells`` in the solid's blocks
-    around : (owned, d) sparse, weights of the cells around each node; rows sum to 1
+    around : (owned, d) sparse matrix, weights of the cells around each node; rows sum to 1
     """
 
     def __init__(self, lattice: Lattice, solid: NeoHookean):
@@ -58,7 +57,7 @@ class StressField:
         """Return the fields at q (l, 3) [m] of owned nodes, and as ``cell_...`` of owned cells.
 
         A stress is a row (6,) of xx, yy, zz, xy, yz, xz [Pa]. Strain energies are [J/m^3] of volume
-        at rest. If J is below J_0, it is replaced by J_0, so that the stress stays finite.
+        at rest. The factor 1 / J is at most 1 / J_0, so that the stress stays finite.
         """
         rows = to_host(self.solid.hessian_at(q, False).state)
         state = rows.reshape(-1, STATE, LANES).transpose(0, 2, 1).reshape(-1, STATE)[self.lanes]

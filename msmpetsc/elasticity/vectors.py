@@ -1,4 +1,4 @@
-"""Algebra of vectors of three numbers, and of matrices as three columns, inside kernels."""
+"""Algebra of vectors (3,), and of 3 x 3 matrices stored as three columns, inside kernels."""
 
 from typing import TypeAlias
 
@@ -54,7 +54,7 @@ def times(a: float, x: Three) -> Three:
 
 @njit(inline="always")
 def combined(t: Vector, x: Three) -> Vector:
-    """Return the sum of t_i x_i: the product of the matrix with columns x and t."""
+    """Return the sum of t_i x_i: the product of the matrix with columns x and the vector t."""
     a, b, c = t
     f, g, h = x
     return (
@@ -72,14 +72,14 @@ def each(t: Three, x: Three) -> Three:
 
 @njit(inline="always")
 def transposed(t: Three) -> Three:
-    """Return the rows of a matrix."""
+    """Return the transpose of a matrix."""
     x, y, z = t
     return (x[0], y[0], z[0]), (x[1], y[1], z[1]), (x[2], y[2], z[2])
 
 
 @njit(inline="always")
 def inner(x: Three, y: Three) -> float:
-    """Return the sum of x_i . y_i."""
+    """Return the sum of x_i . y_i over i."""
     return dot(x[0], y[0]) + dot(x[1], y[1]) + dot(x[2], y[2])
 
 

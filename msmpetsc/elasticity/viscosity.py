@@ -1,14 +1,14 @@
 """Kelvin-Voigt viscosity of a neo-Hookean solid in an implicit step of length tau.
 
-K is the Hessian of E at rest for mean strains alone, each cell's part rotated as the cell has
-rotated. With x^ the positions before the step, the step's dissipation potential is
+K is the Hessian of E at rest for mean strains alone. Each cell's part of K is rotated as the cell
+has rotated. With x^ the positions before the step, the step's dissipation potential is
 
     D(x) = beta / (2 tau) (x - x^)^T K (x - x^).
 
-It adds the forces beta K v, v = (x - x^) / tau, so the viscosities are beta mu and beta lambda. K
-is constant within a step, so D is convex. A rigid rotation dissipates only as far as it differs
-from the rotation given to ``Viscosity.begin``. The modes of a cell are left out, because K would
-have to rotate them, too. In a bend over n cells their share is 1 / n^2.
+D adds the gradient beta K v with v = (x - x^) / tau, so the viscosities are beta mu and
+beta lambda. K is constant within a step, so D is convex. A rigid rotation dissipates only as far as
+it differs from the rotation given to ``Viscosity.begin``. The modes of a cell are left out, because
+K would have to rotate them, too. In a bend over n cells their share of the energy is 1 / n^2.
 """
 
 import numpy as np
@@ -24,9 +24,9 @@ from msmpetsc.elasticity.solid import CellHessians, NeoHookean
 
 @kernel
 def _turned_states(first: int, count: int, step: int, q: Positions, cells: CellRows) -> None:
-    """Write the state of cells at rest, rotated as the cells at q (l, 3) [m], for their Hessians.
+    """Write the Hessians' states of cells at rest, rotated as the cells at q (l, 3) [m] are.
 
-    A flat or inverted cell has no rotation. Its K is not rotated, and resists rotations, too.
+    A cell with J <= J_0 has no rotation: its K is not rotated, and resists rotations, too.
     """
     for i in range(first, count, step):
         k = constants_at(cells, i)
@@ -41,7 +41,7 @@ class Viscosity:
 
     factor : beta / tau [-]
     owned  : number of nodes that this rank owns
-    before : x^ (l, 3) [m], the positions before the step; the rest positions until ``begin``
+    before : x^ (l, 3) [m], positions before the step; positions at rest until ``begin``
     """
 
     def __init__(self, solid: NeoHookean, factor: float, owned: int, before: Positions):

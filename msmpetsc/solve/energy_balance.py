@@ -9,13 +9,14 @@ If the energy is convex, an exactly solved step of implicit Euler satisfies
 - C is the contact energy. Both sides take the obstacles at their positions at the step's end.
 - f is the mean of f_ext over the step.
 - q'_n is q_n with the anchored nodes at their prescribed positions at the step's end.
-- W bounds the work of moving obstacles: by friction, and by impacts as impulse times velocity.
+- W bounds the work of moving obstacles: by friction, and by impacts as impulse times velocity. W
+  also has the energy that viscosity and the elastic slips of friction release.
 
 Spurious energy is the excess of the left side, less its later dissipation. Messages call it energy
-from nowhere. Energy of nodes that rebound after the solve enters the balance of the next step,
+from nowhere. If nodes rebound after the solve, their energy enters the balance of the next step,
 because the next step dissipates most of it.
 
-For Verlet, W holds the work of anchors, moving obstacles and f_ext in the substeps. Therefore f is
+For Verlet, W is the work of anchors, moving obstacles and f_ext in the substeps. Therefore f is
 absent, q'_n is q_n, and C is taken at the start of the step. The energy of Verlet and BDF2
 oscillates, so a step may regain a limited share of earlier losses. In a linear body, the energy of
 Verlet with substeps dt oscillates by
@@ -43,13 +44,16 @@ from msmpetsc.errors import StepFailed
 from msmpetsc.solve.integrators.integrator import EnergyBudget, State
 from msmpetsc.solve.nonlinear.step import StepResult
 
-# spurious energy that fails a step, over all energy; Verlet may oscillate by nearly 2
+# spurious energy that fails a step [largest legitimate energy]; Verlet may oscillate by
+# nearly 2
 FAILING_GAIN = 3.0
-# spurious energy that is worth a warning, over all energy; a viewer may notice more
+# spurious energy that is worth a warning [largest legitimate energy]; a viewer may
+# notice more
 NOTABLE_GAIN = 0.01
-# energy that an oscillation may regain, over all energy; BDF2 loses 0.06 in an impact
+# energy that an oscillation may regain [largest legitimate energy]; BDF2 loses 0.06 in
+# an impact
 OSCILLATION_CREDIT = 0.1
-# least legitimate energy, over that of crushed springs; rounding may gain less
+# least legitimate energy [energy that crushes all springs]; rounding gains less
 FLOOR = 1e-10
 
 
@@ -57,8 +61,9 @@ FLOOR = 1e-10
 class Energies:
     """Energies [J] and momentum (3,) [kg m/s] of a body at a given time.
 
-    free  : kinetic energy of the nodes without prescribed displacement
-    touch : contact of the surface with itself
+    free    : kinetic energy of the nodes without prescribed displacement
+    contact : penalty energy of obstacles
+    touch   : contacts of surfaces, with their energy
     """
 
     kinetic: float
@@ -80,7 +85,7 @@ class EnergyBalance:
     """Check the energy of each step of a run; the states carry the energy budget.
 
     swings   : whether the energy of the integrator oscillates
-    energies : energies at the time that ``show`` was called for last
+    energies : energies of the last call of ``show``
     floor    : least energy [J] that counts as legitimate
     """
 
@@ -102,7 +107,7 @@ class EnergyBalance:
     def _energies(self, q: Positions, v: Rows, time: float, sides: Indices | None) -> Energies:
         """Return the energies at q (l, 3) [m] with velocities v (l, 3) [m/s] (collective).
 
-        time  : time [s] that forces and obstacles are taken at
+        time  : time [s] of forces and obstacles
         sides : (o, l) contact faces of the nodes
         """
         lattice, environment = self.lattice, self.environment
@@ -128,7 +133,7 @@ class EnergyBalance:
     ) -> tuple[State, bool]:
         """Return the state after a step with its energy budget, and whether a history gains energy.
 
-        The history of BDF2 may return the energy that an impact took (collective).
+        The history of BDF2 may return energy that an impact took (collective).
 
         Raises StepFailed if a number is not finite, or if the spurious energy is above
         FAILING_GAIN times the largest legitimate energy.
@@ -144,9 +149,9 @@ class EnergyBalance:
     ) -> bool:
         """Return whether a solved step gains more than NOTABLE_GAIN of all energy (collective).
 
-        Count energy and work in a frame that moves with the obstacles that press at the start or
-        the end of the step: in another frame they do work. If no obstacle presses, the frame moves
-        with the body, so that rigid motion does not matter.
+        Energy and work are counted in a frame that moves with the obstacles that press at the start
+        or the end of the step. In any other frame these obstacles do work. If no obstacle presses,
+        the frame moves with the body, so that rigid motion has no effect.
         """
         lattice, owned = self.lattice, slice(self.lattice.owned)
         displacement = result.position[owned] - result.previous[owned]
@@ -170,7 +175,7 @@ class EnergyBalance:
             frame = sums[5:8] / (pressing * time_step)
         else:
             frame = np.where(is_fixed, 0.0, momentum / mass)
-        # Impacts follow the solve: the next step starts with their energy.
+        # Impacts follow the solve, so the next step starts with their energy.
         start, _, work, _, _ = self._start(before, result, after, time, time_step, frame)
         ended = self.energies.inner - momentum @ frame + 0.5 * mass * frame @ frame
         gained = ended - start - work
@@ -187,7 +192,7 @@ class EnergyBalance:
             raise StepFailed(
                 f"left numbers that are not finite, {self._worst(result.position)}", "not finite"
             )
-        # An equilibrium does not depend on the energy before.
+        # An equilibrium does not depend on earlier energy.
         if result.static:
             return before.budget
         # Obstacles that reflect nodes change the state after the solve.
@@ -256,8 +261,8 @@ class EnergyBalance:
     ) -> Floats:
         """Return the terms (5,) [J] of the right side of the balance (collective).
 
-        The first terms are the energy at the start and the contact energy in it. The next are the
-        work of loads and friction and the work in StepResult. The last is the known oscillation.
+        The terms are the energy at the start, its contact part, the work of loads and friction, the
+        work in StepResult, and the oscillation.
 
         frame : velocity (3,) [m/s] of the frame in which energies and work are counted
         """
@@ -278,7 +283,7 @@ class EnergyBalance:
         pressing = result.problem and result.problem.contact
         surface = pressing and pressing.surface
         work = 0.0
-        # Explicit steps count the work of loads themselves.
+        # Explicit steps count the work of loads in StepResult.
         if not result.explicit:
             loads = environment.forces.mean(time - time_step, time)
             work = np.vdot(loads.force, ended[0] - q[owned] - shift)

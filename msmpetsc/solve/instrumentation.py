@@ -45,12 +45,12 @@ EVENTS = {
     "cycle": [CYCLE.name],
     "fine": [FINE.name],
 }
-# relative error of a step that is worth a warning; more iterations are needed
+# relative error of a step above which a warning is due [-]
 FAR = 0.3
 
 
 class TrueErrors:
-    """Measure true errors of steps against steps solved to rounding, which are not timed.
+    """Measure true errors of steps against steps solved to rounding. Their time is not counted.
 
     stepper   : solver of the run that the reference solver was made for
     reference : solver of the reference steps
@@ -61,9 +61,9 @@ class TrueErrors:
         self.reference: Stepper | None = None
 
     def errors(self, stepper: Stepper, problem: StepProblem, position: Positions) -> Floats:
-        """Return the errors (2,) of a step's solution (l, 3) [m] (collective).
+        """Return the errors (2,) of a step's solution ``position`` (l, 3) [m] (collective).
 
-        They are the relative position error |x - x*|_M / |y - x*|_M and the relative energy error
+        The relative position error is |x - x*|_M / |y - x*|_M, the relative energy error
         (g(x) - g*) / (g(y) - g*). Both are NaN if the reference solve fails.
         """
         try:
@@ -131,12 +131,12 @@ def times(comm: MPI.Comm, before: dict[str, float]) -> dict[str, float]:
 
 
 class Monitors:
-    """Watch the frames of a run and warn once of each kind of trouble, alike on all ranks.
+    """Watch a run and warn once of each kind of trouble, alike on all ranks.
 
-    work      : work of the steps since the frame stored before
-    frames    : frames with inverted cells
-    far       : frames with a step far from its solution
-    gaining   : steps with spurious energy
+    work    : work of the steps since the last stored frame
+    frames  : number of frames with inverted cells
+    far     : number of frames with a step far from its solution
+    gaining : number of steps with spurious energy
     """
 
     state: ClassVar[dict[str, Range]] = {
@@ -183,7 +183,7 @@ class Monitors:
     def overlaps(self, index: int, time: float, q: Positions) -> None:
         """Warn of nodes inside obstacles that begin to act in step ``index`` (collective).
 
-        q : (l, 3) [m] positions before the step
+        q : (l, 3) positions before the step [m]
         """
         for obstacle in self.environment.obstacles.all:
             if not obstacle.acts_at(time) or (index and obstacle.acts_at(time - self.time_step)):

@@ -1,8 +1,8 @@
 """Natural frequencies and mode shapes of a body about a state: K v = omega^2 M v.
 
 K is the Hessian of the energy. H = M + tau^2 K of an implicit step has the same modes, and the
-eigenvalues of M^(-1) H are 1 + (omega tau)^2. H is definite for free bodies, too. Its multigrid
-approximates a shifted inverse, of the shift omega^2 = -1 / tau^2.
+eigenvalues of M^(-1) H are 1 + (omega tau)^2. Unlike K, H is not singular for free bodies. The
+multigrid of H approximates the inverse of K with the shift omega^2 = -1 / tau^2.
 """
 
 from dataclasses import dataclass, replace
@@ -25,22 +25,25 @@ from msmpetsc.solve.petsc.library import petsc_errors
 from msmpetsc.solve.presets import find_preset
 from msmpetsc.solve.simulate import TimeLoop
 
-# Relative error of (omega tau)^2 at which a search ends [-]; frequencies have half
+# Relative error of (omega tau)^2 at which a search ends [-]; frequencies have half this
+# error
 ACCURACY = 1e-7
-# (omega tau)^2 below which a mode is rigid [-]; bars a thousand times as long as thick
-# bend above it, and rounding is below it
+# (omega tau)^2 below which a mode is rigid [-]; above rounding, and below the bending
+# of bars a thousand times as long as thick
 RIGID = 1e-5
-# Relative difference of (omega tau)^2 up to which modes are alike [-]; above the error
+# Relative difference of (omega tau)^2 up to which modes count as equal [-]; above
+# ACCURACY
 ALIKE = 1e-6
-# Modes beyond the count that are searched, so that the last of the count converge [-]
+# Number of modes searched beyond the wanted modes [-]; lets all wanted modes converge
 SPARE = 4
-# Most iterations of a search [-]; usual are 10 to 60, at large strain some 300
+# Greatest number of iterations of a search [-]; 10 to 60 are usual, some 300 at large
+# strain
 MOST_ITERATIONS = 1000
 
 
 @dataclass(frozen=True)
 class Modes:
-    """The lowest modes about a state: rigid modes first, then by frequency.
+    """The lowest modes about a state: rigid modes first, then vibrations by frequency.
 
     frequencies : (k,) [Hz]; 0 for rigid modes, negative if a mode grows at that rate
     shapes      : (k, owned, 3) [-], orthonormal in M over all ranks, zero at fixed nodes
@@ -60,7 +63,7 @@ def modes_of(comm: MPI.Intracomm, scene: Scene, model: Model, count: int) -> Mod
     The state is the last equilibrium of a static scene, the state that ``start.from`` names, or
     the rest shape.
 
-    Raises InputError if the bodies have fewer modes, StepFailed if no state or mode is found.
+    Raises InputError if the bodies have fewer modes, and StepFailed if no state or mode is found.
     """
     if scene.time.integrator == STATIC:
         with TimeLoop(comm, scene, model) as loop:
@@ -80,7 +83,7 @@ def _about(
 ) -> Modes:
     """Return the lowest modes about positions q (l, 3) [m], with a problem's contact.
 
-    time : [s], at which anchors hold
+    time : time [s] whose anchors hold nodes
     """
     lattice = environment.lattice.pin(environment.anchors.fixed_at(time))
     comm, tau = lattice.table.comm, SLENDER * time_of_sound(lattice)
@@ -134,8 +137,8 @@ def _lowest(search: Lobpcg, count: int) -> tuple[Floats, Rows]:
 def _turned(search: Lobpcg, squares: Floats, modes: Rows) -> Rows:
     """Return the modes in a basis that does not depend on rounding.
 
-    Among modes alike, the i-th is orthogonal to the noise vectors before the i-th, and has a
-    positive part in the i-th.
+    Mode i of a group of equal frequencies is orthogonal to the first i noise vectors, counted from
+    0. Its product with noise vector i is positive.
     """
     noise = search.functional.noise(len(modes))
     parts = search.comm.allreduce((modes * search.functional.mass) @ noise.T)

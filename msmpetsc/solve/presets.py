@@ -2,7 +2,7 @@
 
 A user's option overrides the preset's option of the same name. Newton's method with the constant
 matrix A is the paper's local/global iteration x <- x - A^(-1) F(x) (Eq. 17). The options -ksp_ and
--pc_ without a prefix control the linear solve with A, or with the true Hessian for ``newton``.
+-pc_ without a prefix control the linear solve, with A or with the true Hessian.
 """
 
 from collections import Counter
@@ -26,7 +26,7 @@ class Preset:
     start_from_b : whether CG starts from x = b, as in the paper's Algorithm 1
     iterations   : fixed number of iterations from y, as the method was published. None: iterate to
         the error target from the best of several guesses; linear solves near the end of a step
-        then go beyond ksp_rtol
+        may then go beyond ksp_rtol
     """
 
     about: str
@@ -37,12 +37,13 @@ class Preset:
     iterations: int | None = None
 
 
-# largest number of CG iterations in a step and of any counting option; every step ends
+# greatest number of CG iterations in a step, and greatest value of an option that is a
+# count; so that every step ends
 MOST_ITERATIONS = 100_000
 CHOLESKY = {"ksp_type": "preonly", "pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps"}
 CG = {"ksp_type": "cg", "ksp_norm_type": "natural"}
 JACOBI_CG = {**CG, "pc_type": "jacobi"}
-# no stop by the length of the correction; the error alone ends a step or a line search
+# no stop by the length of a correction; the error alone ends a step or a line search
 NO_STOP_BY_SIZE = {"snes_stol": "0"}
 LOCAL_GLOBAL = {
     "snes_type": "newtonls",
@@ -50,7 +51,7 @@ LOCAL_GLOBAL = {
     "snes_max_it": "1000",
     **NO_STOP_BY_SIZE,
 }
-# most iterations of Newton's method; a hard step needs hundreds (test_recovery.py)
+# greatest number of Newton iterations; a hard step needs hundreds (test_recovery.py)
 NEWTON_ITERATIONS = "3000"
 # options of the cycle of -pc_type mg
 LATTICE_MULTIGRID = {
@@ -61,7 +62,7 @@ LATTICE_MULTIGRID = {
     "mg_coarse_redundant_pc_type": "python",
     "mg_coarse_redundant_pc_python_type": "msmpetsc.solve.multigrid.block_cholesky.BlockCholesky",
 }
-# without pc_type, which nonlinear.jacobian chooses
+# options of Newton's method; nonlinear.jacobian chooses pc_type
 NEWTON = {
     "snes_max_it": NEWTON_ITERATIONS,
     **CG,
@@ -147,12 +148,12 @@ PRESETS = {
 }
 
 
-# type option -> option that fits the preset's type only; a user's type drops it
+# type option -> option that fits only the preset's type; a user's type drops it
 BOUND_TO_TYPE = {"pc_type": "pc_factor_mat_solver_type", "ksp_type": "ksp_norm_type"}
-# SNES types that solve with the Jacobian; they take no nonlinear preconditioner
+# SNES types that solve with the Jacobian and take no nonlinear preconditioner
 SOLVE_THEMSELVES = {"newtonls", "newtontr", "ksponly", "vinewtonrsls", "vinewtonssls"}
 
-# preset option in PETSc's database -> number of solvers that use it
+# option of a preset in PETSc's database -> number of solvers that use the option
 in_use: Counter[str] = Counter()
 
 
@@ -185,7 +186,7 @@ def find_preset(name: str) -> Preset:
 def shown_options(solvers: dict[str, tuple[Preset, int]]) -> list[str]:
     """Return the options of solvers, the user's options included, as lines of an options file.
 
-    An adaptive tolerance stands in a comment, because a given tolerance would be fixed.
+    An adaptive tolerance stands in a comment, because a tolerance in the file would be fixed.
 
     solvers : prefix of the solver's options -> preset and budget of iterations
     """

@@ -1,13 +1,13 @@
-"""The ladder of a failed step: all that is tried again, in this order.
+"""Recovery of failed steps: a step is tried again in these ways, in this order.
 
-1. ``take_step``: BDF2 takes the step without its history if this gains energy. After an impact the
-   history holds the energy that the impact took.
+1. ``take_step``: BDF2 takes the step without its history if the history gains energy. After an
+   impact the history holds the energy that the impact took.
 2. ``Halving``: pieces of a load (integrators.static), of a step that ``time.error`` chooses
    (integrators.adaptive.StepControl) or of a scene's step (``Recovery``). A shorter piece starts
    nearer to its solution, and inertia holds nodes nearer to their places.
 3. ``Recovery``: a robust preset solves the step, if ``safety.on_failure`` says so.
 
-A solver has retries of its own, which are no rungs, since no caller has their iterates or problems:
+Solvers also have retries of their own, which need iterates or problems that callers lack:
 
 - the projected Hessian (nonlinear.newton)
 - softer solids, and another point after a saddle (nonlinear.step)
@@ -32,7 +32,7 @@ from msmpetsc.solve.integrators.integrator import Integrator, State
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.work import Work
 
-# most halvings; 1024 pieces bound the cost of a hopeless step or load
+# greatest number of halvings; 1024 pieces bound the cost of a hopeless step or load
 DEEPEST = 10
 # preset of the fallback solver
 ROBUST = "newton-projected"
@@ -67,8 +67,8 @@ class Halving:
     """Pieces of a step or of a load: half as long after a failure, twice as long after a success.
 
     reached : end of the last piece, from 0 to 1
-    level   : halvings of the next piece
-    count   : number of pieces
+    level   : number of halvings of the next piece
+    count   : number of pieces taken
     """
 
     def __init__(self, level: int = 0):
@@ -80,7 +80,7 @@ class Halving:
         return self.reached + 2.0**-self.level
 
     def run(self, take: Callable[[], None]) -> None:
-        """Take pieces until 1 is reached; ``take`` takes the next piece. Raises StepFailed."""
+        """Call ``take``, which takes the next piece, until 1 is reached. Raises StepFailed."""
         while self.reached < 1:
             try:
                 take()
@@ -100,9 +100,10 @@ class Halving:
 class Recovery:
     """Take the steps of a run, and repeat failed steps as ``safety.on_failure`` says.
 
-    take    : takes a step as the scene defines it
-    spare   : number of halvings -> integrator of that step length
-    level   : halvings that the next step starts with, because failures persist
+    take      : takes a step as the scene defines it
+    spare     : number of halvings -> integrator for this step length
+    level     : number of halvings with which the next step starts, because failures persist
+    recovered : number of recovered steps
     """
 
     state: ClassVar[dict[str, Range]] = {"level": (0, DEEPEST), "recovered": COUNT}
@@ -145,7 +146,7 @@ class Recovery:
             log.warning("%d step%s %s", self.recovered, were, WORDS[self.on_failure])
 
     def _in_pieces(self, state: State, time: float) -> tuple[StepResult, State]:
-        """Take a step in pieces, the first of them as long as the last piece before allows."""
+        """Take a step in pieces; the first piece starts with the level that the last step left."""
         pieces, cost = Halving(self.level or 1), Work()
         result = StepResult(state.q, state.q_previous, cost)
 
@@ -160,7 +161,7 @@ class Recovery:
         return replace(result, cost=replace(cost, steps=1)), state
 
     def _take(self, level: int, state: State, time: float) -> tuple[StepResult, State]:
-        """Take a step of t / 2^level between states that belong to steps of t."""
+        """Take a step of length t / 2^level, from and to states for steps of length t."""
         short = self.time_step / 2**level
         if level not in self.spare:
             self.spare[level] = self._new(short)
@@ -171,7 +172,7 @@ class Recovery:
         return replace(result, previous=previous), after.over(short, self.time_step)
 
     def _new(self, short: float) -> Integrator:
-        """Return a new integrator of steps of ``short`` [s].
+        """Return a new integrator with steps of length ``short`` [s].
 
         Implicit Euler replaces BDF2, and in a fallback also Verlet.
         """

@@ -36,11 +36,11 @@ COMMON_OPTIONS = OFTEN_GIVEN.union(*(preset.options for preset in PRESETS.values
 
 NO_PART = "no part of this run uses this PETSc option"
 BY_ERROR = "a step ends when its error is below solver.error (--error), or by solver.max_iterations"
-# option and value that PETSc ignores here or crashes with -> reason
+# pattern of an option and its value that PETSc ignores here or crashes with -> reason
 NO_USE = {
     r"snes_(rtol|atol|divergence_tolerance|max_funcs|convergence_test|norm_schedule"
     r"|force_iteration) .*": BY_ERROR,
-    # Presets set 0.
+    # Presets themselves set 0.
     r"snes_stol (?!0+\.?0*$).*": BY_ERROR,
     r"snes_type (newtontr(dc)?|aspin|nasm|patch|ms)": (
         "it needs a DM of PETSc or ignores the energy of a step; newtonls can"
@@ -69,11 +69,11 @@ NO_USE = {
     ),
 }
 
-# names of options whose value is a count
+# pattern of the names of options whose value is a count
 COUNT = re.compile(
     r"(.*_)?(max_it|its|lits|cycles|levels|(jacobi|asm)_(local_)?blocks|restart|steps|anderson_m|qn_m)"
 )
-# names of options whose value is a positive number
+# pattern of the names of options whose value is a positive number
 POSITIVE = re.compile(r"(.*_)?(rtol|divtol|damping|maxstep|minlambda|alpha|omega)")
 
 
@@ -90,14 +90,14 @@ def refuse_early(comm: MPI.Comm) -> None:
 
 def _bounds_passed(name: str, value: str) -> Iterator[str]:
     """Yield a message if an option's number is missing or outside its bounds."""
-    # PETSc drops such an option, and the preset's value with it
+    # Without a number PETSc drops the option, and with it the preset's value.
     if not value and (COUNT.fullmatch(name) or POSITIVE.fullmatch(name)):
         yield "it needs a number"
     if re.search(r"(^|,)[-+]?nan\b", value, re.IGNORECASE):
         yield f"{value} is not a number"
     try:
         number = float(value)
-    # PETSc itself reports a value that should be a number.
+    # PETSc itself reports a text in place of a number.
     except ValueError:
         return
     if COUNT.fullmatch(name) and (number < 1 or number > MOST_ITERATIONS):
@@ -111,8 +111,8 @@ def refuse_unused(comm: MPI.Comm, at_end: bool = False, awaited: tuple[str, ...]
 
     Options that a preset sets may remain unused.
 
-    at_end  : whether the run has ended; earlier, options that are read while solving may be unused
-    awaited : prefixes of solvers that are made while solving
+    at_end  : whether the run has ended; before, options that are read while solving may be unused
+    awaited : prefixes of solvers that the run may yet make
     """
     unused = [
         name

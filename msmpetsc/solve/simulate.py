@@ -50,14 +50,15 @@ INTEGRATORS: Integrators = {
     "verlet": Verlet,
     "static": Static,
 }
-# steps between checkpoints; caches are dropped there, so that a resumed run agrees
+# number of steps between checkpoints; a checkpoint drops caches, so that a resumed run
+# agrees
 REMEMBERED = 20
 
 
 def solvers_of(scene: Scene, true_error: int | None = None) -> dict[str, tuple[Preset, int]]:
     """Return the solvers of a run: prefix of the PETSc options -> preset, budget of iterations.
 
-    true_error : number of steps between measurements of the true error; None: no measurement
+    true_error : number of steps between measurements of the true error; None without measurement
     """
     solvers = {}
     if scene.time.integrator != "verlet":
@@ -105,9 +106,10 @@ class TimeLoop:
 
     state  : state after the last step
     step   : number of steps taken, of ``steps``
-    stored : number of frames of the whole run; ``stored_until(step)`` of its first steps
+    stored : number of frames of the whole run; ``stored_until(step)`` is the number of frames of
+             its first steps
     system_monitor : called with the number of a step, the first iterate of a solve and its Jacobian
-    saved  : checkpoint of the last ``REMEMBERED``-th step, from which the run may resume
+    saved  : last checkpoint, from which the run may resume; made after each ``REMEMBERED``-th step
     """
 
     def __init__(
@@ -153,7 +155,8 @@ class TimeLoop:
             q, q, 0.0, 0.0, None, self.environment.anchors.fixed_at(0.0).all(axis=1)
         )
         self.state = State(q.copy(), q - self.time_step * velocity, sides=sides)
-        # The first solve reads options that the set-up leaves unread.
+        # Whether options are checked again after the first solve, which reads more of
+        # them than the set-up.
         self.awaits_solve = False
         self.saved = Checkpoint()
 
@@ -162,7 +165,7 @@ class TimeLoop:
         return INTEGRATORS[time.integrator](self.comm, self.environment, time, solver, prefix)
 
     def frames(self) -> Iterator[Frame]:
-        """Yield frame 0, then a frame of every ``every``-th step and of the last (collective).
+        """Yield frame 0, then the frames of each ``every``-th step and of the last (collective).
 
         Raises StepFailed, with the number of the step, on all ranks.
         """
@@ -223,9 +226,9 @@ class TimeLoop:
         return frame
 
     def _save(self) -> Checkpoint:
-        """Return a checkpoint; drop all caches that it does not hold (collective).
+        """Return a checkpoint, and drop all caches that it does not hold (collective).
 
-        A resumed run starts without these caches, and must agree to the last bit.
+        A resumed run starts without these caches and must agree to the last bit.
         """
         checkpoint = Checkpoint(self.step)
         self.state.save(
@@ -243,7 +246,7 @@ class TimeLoop:
 
     @property
     def end(self) -> Checkpoint:
-        """Positions at the last step and before it, from which another run may start."""
+        """Checkpoint with the positions at and before the last step, to start another run from."""
         owned = self.model.lattice.owned
         rows = {"q": self.state.q[:owned], "q_previous": self.state.q_previous[:owned]}
         step = AT_END - self.step
@@ -263,7 +266,7 @@ class TimeLoop:
     def refuse_unused_options(self, at_end: bool = False) -> None:
         """Raise InputError for the user's PETSc options that nothing has used (collective).
 
-        A call before the first step repeats the check after the first step that solves.
+        After a call before the first step, the run repeats the check when a step has solved.
         """
         self.awaits_solve = self.step == 0 and not at_end
         awaited = {
@@ -274,7 +277,7 @@ class TimeLoop:
         refuse_unused(self.comm, not self.awaits_solve, prefixes)
 
     def _frame(self, index: int, q: Positions, step: StepResult | None = None) -> Frame:
-        """Return the frame at q (l, 3) [m] with the work since the frame before (collective)."""
+        """Return the frame at q (l, 3) [m], with the work since the last frame (collective)."""
         time = index * self.time_step
         energies = self.balance.energies
         work = self.monitors.work
@@ -345,10 +348,10 @@ class Forces:
     """Compute the force fields of a frame (fields.Frame) that the scene needs.
 
     The fields are loads, reactions of pins and anchors, and contact forces of obstacles and of the
-    surface. Inertia and friction are taken from the last implicit step. At the start and in
-    explicit steps, fixed nodes do not accelerate and obstacles have no friction.
+    surface. The last implicit step gives inertia and friction. At the start and in explicit steps,
+    reactions leave out inertia, and contact forces leave out friction.
 
-    rows : name of a field -> its number of rows
+    rows : name of a field -> number of its rows
     """
 
     def __init__(self, model: Model, environment: Environment, elasticity: Elasticity):
@@ -409,7 +412,7 @@ class Forces:
     def _holding_forces(
         self, q: Positions, contact: StepContactAt | None, step: StepResult | None
     ) -> Rows:
-        """Return the forces (owned, 3) [N] that hold the nodes in place, without the loads."""
+        """Return the sums (owned, 3) [N] of reaction and load on the nodes."""
         forces, owned = np.zeros_like(q), self.model.lattice.owned
         self.elasticity.add_gradient(q, forces)
         if contact:
@@ -426,7 +429,7 @@ class Forces:
         return forces
 
     def _pushes(self, q: Positions, contact: StepContactAt | None) -> dict[str, Any]:
-        """Return the contact forces [N] of obstacles (o, 3) and on bodies (b, 3) of this rank."""
+        """Return this rank's contact forces [N]: of obstacles (o, 3), and on bodies (b, 3)."""
         lattice, owned = self.model.lattice, self.model.lattice.owned
         push = np.zeros((len(self.keys), 3))
         for state, pressed in contact.of_obstacles if contact else ():

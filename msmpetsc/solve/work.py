@@ -7,17 +7,17 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Work:
-    """Work and errors of some steps: counts add up, the largest error remains.
+    """Work and errors of some steps. A sum adds counts and keeps the largest errors.
 
     step_error     : estimated relative error of a step
     iterations     : SNES iterations, or substeps of an explicit integrator
     ksp_its        : KSP iterations of the solves and of the error estimates
     products       : products with the Hessian, multigrid's finest level included
-    proof_products : of these, products of error estimates and searches for negative curvature
+    proof_products : the products among them of error estimates and searches for negative curvature
     steps          : accepted steps
-    substeps       : shorter steps in place of a failed step
+    substeps       : shorter steps that replace failed steps
     fallbacks      : steps solved by the robust method
-    wall_time      : [s]
+    wall_time      : time of the steps [s]
     true_error     : relative position error against a step solved to rounding, or NaN
     energy_error   : relative energy error against a step solved to rounding, or NaN
     """

@@ -13,16 +13,17 @@ from msmpetsc.errors import InputError
 from msmpetsc.extensions import DistanceFunction
 from msmpetsc.geometry.surface import Surface
 
-# grid points per axis for a function's surface [-]; for pictures only
+# grid points per axis for the surface of a function [-]; for pictures only
 POINTS = 65
 # margin of that grid around the bodies [fraction of their longest side]
 MARGIN = 1.0
-# longest displacement for the trapezoidal rule [fraction of the depth]; the difference
-# of two depths has more digits over a longer displacement
+# longest displacement for the trapezoidal rule [fraction of the depth]; over a longer
+# displacement a difference of depths has more digits
 SHORT = 1e-4
 # barycentric coordinate that counts as zero [-]; the point is then on an edge
 ON_AN_EDGE = 1e-9
-# distance without a direction [fraction of the largest coordinate]; close to rounding
+# largest depth at which a point counts as on the surface [fraction of the largest
+# coordinate]; close to rounding
 ROUNDED = 1e-14
 
 
@@ -39,8 +40,8 @@ class DistanceSolid(Solid):
     def depth_change(self, q: Positions, moved: Rows, face: Indices) -> Floats:
         """Return the change of depth (n,) [m] from q - moved to q, in the solid.
 
-        A short displacement uses the trapezoidal rule. Its error is |moved|^3 / (12 r^2) if r is
-        the surface's radius of curvature.
+        A short displacement uses the trapezoidal rule. With the surface's radius of curvature r,
+        its error is |moved|^3 / (12 r^2).
         """
         face = to_host(face)
         displacement = to_host(moved)
@@ -53,7 +54,7 @@ class DistanceSolid(Solid):
 
     @abstractmethod
     def surface(self, low: Positions, high: Positions) -> Surface:
-        """Return the solid's surface, for pictures, around bodies between two corners (3,) [m]."""
+        """Return the solid's surface for pictures, near bodies between two corners (3,) [m]."""
 
     @abstractmethod
     def _find(self, q: Positions) -> tuple[Floats, Indices]:
@@ -76,7 +77,7 @@ class FunctionSolid(DistanceSolid):
     def distances(self, q: Positions) -> tuple[Floats, Rows]:
         """Return the signed distances (n,) [m] of positions (n, 3) [m], and their gradients (n, 3).
 
-        Raises InputError if the function's result has a wrong shape or is not finite.
+        Raises InputError if the function's result has the wrong shape or is not finite.
         """
         if not len(q):
             return np.zeros(0), np.zeros((0, 3))
@@ -97,7 +98,7 @@ class FunctionSolid(DistanceSolid):
         return distance, gradient
 
     def surface(self, low: Positions, high: Positions) -> Surface:
-        """Return the surface by marching cubes; it is open at the end of the grid."""
+        """Return the surface by marching cubes; it is open where the grid ends."""
         import igl
 
         margin = MARGIN * (high - low).max()

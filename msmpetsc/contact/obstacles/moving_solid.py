@@ -1,4 +1,4 @@
-"""Moving obstacles: their construction from a scene's tables, and the depths of nodes in them."""
+"""Moving obstacles, built from a scene's tables, and the depths of nodes in obstacles."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,9 +22,9 @@ from msmpetsc.scene.body import MeshTable
 from msmpetsc.scene.obstacles import ObstacleTable
 from msmpetsc.scene.reading import Scene
 
-# depth that counts as touching [cell]; above rounding
+# greatest depth that counts as touching, not as overlap [cells]; above rounding
 TOUCHING = 1e-6
-# deviation of a distance's gradient from unit length [-]; a rough test of functions
+# greatest deviation of a signed distance's gradient from unit length [-]; a rough test
 GRADIENT_TOLERANCE = 0.01
 
 
@@ -35,8 +35,8 @@ class Obstacle(Timed):
     solid   : the solid in its pose at time 0
     path    : motion of the solid
     key     : key of its table in the scene, for messages
-    outside : (l,) distance of nodes outside of the surface at rest [m] (lattice.nearest_points),
-              which is subtracted from their depth; None if the nodes are the surface
+    outside : (l,) distance by which nodes lie outside the surface at rest [m]
+              (lattice.nearest_points), subtracted from their depth; None for whole cells
     """
 
     solid: Solid
@@ -51,7 +51,7 @@ class Obstacle(Timed):
     def depths(
         self, q: Positions, time: float, sides: Indices | None = None
     ) -> tuple[Floats, Indices]:
-        """Return depths (n,) [m] of the surface at nodes q (n, 3) [m], and the faces (n,).
+        """Return depths (n,) [m] of the surface at nodes q (n, 3) [m], and faces (n,).
 
         sides : (n or more,) sides of the nodes (solids.side_of); None for the nearest face
         """
@@ -86,7 +86,7 @@ class Obstacle(Timed):
         return self.solid.sides_of(self.seen_from(q, begin), self.seen_from(end, time), before)
 
     def sent(self, send: Send) -> "Obstacle":
-        """Return the obstacle with the arrays of a step's work on the device of ``send``."""
+        """Return the obstacle with the arrays that a step uses, moved to a device by ``send``."""
         outside = None if self.outside is None else send(self.outside)
         return replace(self, solid=self.solid.sent(send), outside=outside)
 
@@ -96,9 +96,9 @@ def build_obstacles(
 ) -> list[Obstacle]:
     """Return the obstacles of a scene (collective).
 
-    outside : (l,) distance of nodes outside of the surface at rest [m]
+    outside : (l,) distance by which nodes lie outside the surface at rest [m]
 
-    Raises InputError on all ranks if a mesh is not closed or a function is no signed distance.
+    Raises InputError on all ranks if a mesh is not closed or a function is not a signed distance.
     """
     obstacles = []
     for number, table in enumerate(scene.obstacle):
@@ -125,9 +125,9 @@ def obstacle_surface(mesh: MeshTable, key: str, folder: Path) -> Surface:
 
 
 def _solid(comm: MPI.Comm, table: ObstacleTable, key: str, folder: Path, nodes: Positions) -> Solid:
-    """Return the solid of a table. A function is checked at the nodes (owned, 3) [m] at rest.
+    """Return the solid of a table. A function is tested at the nodes (owned, 3) [m] at rest.
 
-    Raises InputError if a mesh is not closed or a function is no signed distance.
+    Raises InputError if a mesh is not closed or a function is not a signed distance.
     """
     if table.mesh is not None:
         mesh = table.mesh
@@ -151,9 +151,9 @@ def _solid(comm: MPI.Comm, table: ObstacleTable, key: str, folder: Path, nodes: 
 def describe_overlap(
     comm: MPI.Comm, lattice: Lattice, obstacle: Obstacle, q: Positions, fixed: Mask, time: float
 ) -> str | None:
-    """Return a description of the free nodes inside an obstacle; None without nodes (collective).
+    """Return a message about free nodes inside an obstacle; None if there are none (collective).
 
-    Such an overlap is seldom intended, and an obstacle that reflects does not remove it.
+    Users seldom intend an overlap, and an obstacle that reflects does not remove it.
 
     q     : (l, 3) positions [m]
     fixed : (l,) bool, the nodes that are not free

@@ -31,9 +31,9 @@ class NodeFriction(Friction):
     carried: Positions
 
     def after(self, last: "NodeFriction | None", q: Positions) -> "NodeFriction":
-        """Return the friction with the elastic slips of the step before, at q (owned, 3) [m].
+        """Return the friction that begins with the last step's elastic slips, at q (owned, 3) [m].
 
-        last : friction of the step before; None without it
+        last : friction of the last step; None without it
         """
         slips = np.zeros_like(q)
         if last:
@@ -78,12 +78,12 @@ class Movers(NamedTuple):
 def apply_friction(nodes: Movers, pressed: Pressed, carried: Rows, impulse: float) -> None:
     """Apply Coulomb friction to nodes inside an obstacle, as a change of velocity.
 
-    The tangential velocity relative to the obstacle decreases by mu N dt / m, but not below zero.
-    So a sticking contact does not creep, for any length of the substep.
+    The tangential speed relative to the obstacle decreases by mu N dt / m, but not below zero. So
+    a sticking contact does not creep, however long the substep is.
 
     pressed : rows (a,) of the nodes inside, their depths (a,) [m] and the normals (a, 3)
     carried : (3,) velocity of the obstacle [m/s]
-    impulse : mu k dt [kg/s], the friction's impulse over the depth
+    impulse : mu k dt [kg/s], impulse of friction per depth
     """
     v = nodes.v
     moves = np.zeros(len(v), bool, like=v)

@@ -14,16 +14,16 @@ from msmpetsc.contact.obstacles.reflection import Exchange, StepTaken, slowed
 from msmpetsc.contact.step_contact import StepContact
 from msmpetsc.lattice.lattice import Lattice
 
-# positions (owned, 3) [m] and sides (o, owned or more); None without contact
+# positions (owned, 3) [m] and sides (o, owned or more), which are None without contact
 Placed = tuple[Positions, Indices | None]
 
 
 class NodeObstacles:
-    """Obstacles that act on nodes: penalties, which press, and exchanges, which reflect.
+    """Obstacles that act on nodes: penalties press nodes, and exchanges reflect them.
 
     Positions are local, (l, 3) [m], ghosts included. ``time`` [s] is the end of a step, and
     ``time_step`` [s] its length. ``sides`` (o, l) has a row per obstacle, penalties first, with the
-    face by which each node is in contact (solids.side_of).
+    side of each node (solids.side_of).
     """
 
     def __init__(
@@ -90,9 +90,11 @@ class NodeObstacles:
     ) -> list[ObstacleContact]:
         """Return the penalty contacts in a step from q, with friction.
 
-        last, end : see Environment.contact
-        step      : time of the step's end, and its length [s]
-        before    : contact of the step before, whose elastic slips continue; None without it
+        last   : (l, 3) positions a step before q [m], for BDF2; None otherwise
+        end    : (l, 3) end positions of an earlier solve of the step [m], which then give the
+                 normal forces of friction; None otherwise
+        step   : time of the step's end, and its length [s]
+        before : contact of the last step, whose elastic slips continue; None without it
         """
         time, time_step = step
         owned = self.lattice.owned
@@ -129,7 +131,10 @@ class NodeObstacles:
     def energy_of_new_obstacles(
         self, q: Positions, begin: float, end: float, sides: Indices
     ) -> float:
-        """Return the energy [J] at a substep's end of penalties that began to act in it."""
+        """Return the energy [J] of penalties that began to act in a substep, at its end.
+
+        begin, end : times [s] of the substep
+        """
         new = [
             p.state_at(end, side)
             for p, side in self._pressing(end, sides)
@@ -142,7 +147,10 @@ class NodeObstacles:
     ) -> float:
         """Return a bound of the work [J] of moving obstacles' friction on owned nodes in a step.
 
-        The bound is mu N times the obstacles' distance in a frame displaced by ``frame`` (3,) [m].
+        The bound is the sum of mu N at the step's start and end, times the obstacle's displacement
+        relative to the frame.
+
+        frame : (3,) displacement of the frame of reference in the step [m]
         """
         work = 0.0
         for row, p in enumerate(self.penalties):
@@ -159,8 +167,8 @@ class NodeObstacles:
     ) -> tuple[float, Floats]:
         """Return the sum of penalty forces [N], and the sum (3,) [N m] of force times displacement.
 
-        The sums are over this rank's nodes at a step's start and end, with the obstacles'
-        displacements in the step.
+        Both sums run over this rank's nodes, at a step's start and at its end. The displacement is
+        the obstacle's in the step.
         """
         total, weighted = 0.0, np.zeros(3)
         for row, p in enumerate(self.penalties):
@@ -175,7 +183,10 @@ class NodeObstacles:
     def change_of_push(
         self, before: Placed, after: Placed, time: float, time_step: float
     ) -> Floats:
-        """Return the change (owned,) [N] in a step of the penalty force on each owned node."""
+        """Return how much a step changes the penalty forces on each owned node, (owned,) [N].
+
+        The result is the sum over obstacles of k times the absolute change of depth.
+        """
         change = np.zeros(self.lattice.owned, like=self.lattice.mass)
         for row, p in enumerate(self.penalties):
             depth_change = np.zeros_like(change)
@@ -204,7 +215,7 @@ class NodeObstacles:
     ) -> tuple[Positions, Positions, float]:
         """Return q_n and q_(n-1) after impacts on obstacles, and the work [J] on this rank's nodes.
 
-        The arrays are the same objects if no node strikes.
+        If no node strikes, the arrays are the arguments themselves.
 
         step  : the completed step, with the sides (o, l) for all obstacles
         fixed : (l, 3) bool, the components that are not free

@@ -6,9 +6,9 @@ A node at depth d > 0 has the energy 1/2 k d^2, which is convex for a single fac
 A step of BDF2 uses N_(n+1) = 2 N_n - N_(n-1) as the normal force of friction, and the slip
 u = tau v_(n+1) (solve.integrators.implicit).
 
-The ``side`` of a node is the face by which it entered a box. Its depth is measured from this face,
-also beyond the opposite face, so a node that passes a plate in a step is pushed back. Without a
-side, depth is measured from the nearest face.
+The ``side`` of a node is the face by which the node entered a box. Depth is measured from this
+face, even beyond the opposite face, so a node that passes a plate in a step is pushed back. Without
+a side, depth is measured from the nearest face.
 """
 
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.obstacles.node_friction import NodeFriction, Pressed
 from msmpetsc.scene.obstacles import ObstacleTable
 
-# default stiffness [stiffest spring]; so that nodes sink in by little
+# default stiffness [stiffness of the stiffest spring]; nodes then sink in by little
 STIFFNESS = 10.0
 
 
@@ -32,8 +32,8 @@ class Penalty:
     stiffness   : k of each node [N/m]
     friction    : coefficient mu [-]
     stick       : slip speed below which a contact sticks [m/s]
-    restitution : normal speed of a node after an impact over the speed before [-]; None: no change
-                  of speed but by the penalty
+    restitution : normal speed of a node after an impact over the speed before [-]; None: only the
+                  penalty changes the speed
     """
 
     obstacle: Obstacle
@@ -73,8 +73,8 @@ class Penalty:
 
         last : (owned or more, 3) positions a step before q [m], for a step of BDF2. Friction then
                uses the velocity and the extrapolated normal force at the step's end.
-        end  : (owned, 3) positions at the end of an earlier solve of the step [m], which then give
-               the normal force
+        end  : (owned, 3) end positions of an earlier solve of the step [m], which then give the
+               normal force
         """
         state = self.state_at(time, sides)
         if self.friction == 0:
@@ -115,12 +115,15 @@ class ObstacleContact:
     friction: NodeFriction | None = None
 
     def after(self, before: "list[ObstacleContact]", q: Positions) -> "ObstacleContact":
-        """Return the contact with the elastic slips of the states ``before`` at q (owned, 3)."""
+        """Return the contact that continues the elastic slips of ``before`` at q (owned, 3) [m].
+
+        before : contacts of the last step with all obstacles
+        """
         last = next((state.friction for state in before if state.penalty is self.penalty), None)
         return replace(self, friction=self.friction.after(last, q)) if self.friction else self
 
     def friction_limits(self, q: Positions) -> Floats:
-        """Return the sum of mu N [N] that friction uses, and its value at q (owned, 3), as (2,)."""
+        """Return the sums of mu N [N], (2,): as friction uses it, and at q (owned, 3)."""
         if not self.friction:
             return np.zeros(2)
         _, depth, _ = self.pressed(q)

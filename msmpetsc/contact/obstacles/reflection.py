@@ -3,9 +3,9 @@
 The state has q_n and q_(n-1) in place of a velocity. There are two laws:
 
 - ``slowed`` scales the normal velocity of a striking node by e through a new q_(n-1). The node's
-  position stays, so no energy is added. The push of the penalty then reverses the velocity.
+  position stays, so no energy is added. The penalty force then reverses the velocity.
 - ``Exchange`` is the paper's reflection (section 5): v_(n+1) = -v_n by q_(n+1) = q_(n-1). It moves
-  nodes against their springs, which adds energy. So this contact is not conservative.
+  nodes against their springs and thereby adds energy, so it is not conservative.
 """
 
 from dataclasses import dataclass
@@ -58,9 +58,11 @@ class Exchange:
 def slowed(
     obstacle: Obstacle, restitution: float, q: Positions, q_previous: Positions, step: StepTaken
 ) -> Positions:
-    """Return q_(n-1) (n, 3) [m] that scales the normal velocity of striking nodes by restitution e.
+    """Return a q_(n-1) (n, 3) [m] that scales the normal velocity of striking nodes by e.
 
     A node strikes in the step in which it reaches a face.
+
+    restitution : e [-]
     """
     rows, into = striking(obstacle, q, q_previous, step)
     before = obstacle.depths(q_previous, step.time - step.length, step.sides)[0][rows]

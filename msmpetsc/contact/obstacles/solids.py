@@ -1,6 +1,7 @@
-"""Solids that obstacles consist of: planes, boxes and balls.
+"""Solids as shapes of obstacles: half spaces, boxes and balls.
 
-A solid is fixed in its pose at time 0. For a moving obstacle, positions are given in its frame.
+A solid has a fixed pose: its pose at time 0. If the obstacle moves, positions are given in its
+frame.
 """
 
 from abc import ABC, abstractmethod
@@ -17,14 +18,15 @@ from msmpetsc.backend.kernel import kernel, njit
 TINY = 1e-300
 # largest cosine between the normals of opposite faces [-]; -1 up to rounding
 OPPOSITE = -1 + 1e-9
-# rounding of a crossing [fraction of a path]; a plate of zero thickness stops nodes
+# rounding of a crossing [fraction of a path]; so that a plate of zero thickness stops
+# nodes
 ROUNDED = 1e-12
 
 Send = Callable[[Array], Array]
 
 
 class Solid(ABC):
-    """A solid, whose faces have numbers from 0. Positions are (n, 3) [m]."""
+    """A solid with faces numbered from 0. Positions are (n, 3) [m]."""
 
     @property
     def has_sides(self) -> bool:
@@ -35,7 +37,7 @@ class Solid(ABC):
     def depths(self, q: Positions, sides: Indices | None = None) -> tuple[Floats, Indices]:
         """Return the depths (n,) [m] of positions behind a face, and the numbers (n,) of the faces.
 
-        The depth outside is negative, and at least minus the distance.
+        Outside, the depth is negative. Its magnitude is at most the distance to the solid.
 
         sides : (n or more,) 1 + the face by which each node entered; 0 for the nearest face
         """
@@ -54,7 +56,7 @@ class Solid(ABC):
         """
 
     def sent(self, send: Send) -> "Solid":
-        """Return the solid with the arrays of a step's work on the device of ``send``."""
+        """Return the solid with the arrays that a step uses, moved to a device by ``send``."""
         return self
 
 
@@ -95,7 +97,8 @@ def behind(q: Positions, i: int, planes: Planes, face: int) -> float:
 def depth(q: Positions, i: int, planes: Planes, side: int) -> tuple[float, int]:
     """Return the depth [m] of q[i] behind the face of its ``side``, and the number of the face.
 
-    If ``side`` is 0, return the depth in the solid, not positive outside, and the nearest face.
+    If ``side`` is 0, return the depth in the solid and the nearest face. Outside, the depth is not
+    positive.
     """
     if side > 0:
         return behind(q, i, planes, side - 1), side - 1
@@ -128,17 +131,17 @@ def _stays(q: Positions, i: int, planes: Planes, face: int) -> bool:
 def side_of(q: Positions, end: Positions, i: int, planes: Planes, side: int) -> int:
     """Return 1 + the face by which a node is in contact on its straight path from q[i] to end[i].
 
-    The result is 0 if the node does not meet the solid. The test is for the node itself, which may
-    lie outside of the body's surface. So a node with a side may still have no depth.
+    The result is 0 if the node does not meet the solid. The node itself is tested, which may lie
+    outside the body's surface. So a node with a side may still have no depth.
 
-    side : the node's side before, which it keeps until it leaves the solid
+    side : the node's side before the step, which it keeps until it leaves the solid
     """
     if side > 0 and _stays(q, i, planes, side - 1):
         return side
     inside, face = depth(q, i, planes, 0)
     if inside > 0.0:
         return face + 1
-    # Fractions of the path at which the node enters the solid and leaves it.
+    # Fractions of the path at which the node enters and leaves the solid.
     enter, leave, side = -1.0, 1.0, 0
     for f in range(len(planes.points)):
         first, last = behind(q, i, planes, f), behind(end, i, planes, f)
@@ -201,7 +204,7 @@ class Faces(Solid):
     def sides_of(self, q: Positions, end: Positions, before: Indices) -> Indices:
         """Return ``side_of`` (n,) for nodes on straight paths from q to ``end`` (n, 3) [m].
 
-        before : (n,) the nodes' sides before
+        before : (n,) the nodes' sides before the step
         """
         paths = Paths(end, before, no_sides(q))
         _sides_of(len(q), q, self.planes, paths)

@@ -4,13 +4,13 @@ Two parts of triangles closer than dhat have the energy kappa a b(d) (Li et al. 
 Potential Contact). Here a is an area of the surface and d the distance of the parts.
 b = -2 ((d/dhat)^2 - 1)^2 ln(d/dhat) is smooth at dhat and unbounded at d = 0.
 
-A place of contact that several pairs have in common counts once (contact.surface.places). So the
-energy is continuous, and equal over a vertex and beside it. If all pairs counted, aligned meshes
+If several pairs share a place of contact, the place counts once (contact.surface.places). So the
+energy is continuous, and as large over a vertex as beside it. If all pairs counted, aligned meshes
 would push each other aside. If the nearest pairs alone counted (Chen et al. 2025, Offset Geometric
 Contact), the energy would jump as the nearest part changes, and line searches would fail.
 
-Pairs in creases push from smaller distances (contact.surface.creases), so that contacts have a set
-for each distance.
+Pairs in creases push from smaller distances (contact.surface.creases). Candidates and contacts are
+therefore tuples with a set for each distance.
 
 ipctk runs on a single thread, so that sums are reproducible. Its arrays are in Fortran's order.
 """
@@ -35,11 +35,11 @@ if TYPE_CHECKING:
     import ipctk
     from scipy.sparse import csc_matrix
 
-# A set of candidates, or of contacts, for each distance from which pairs push
+# A set of candidates or contacts for each distance from which pairs push
 CandidateSets: TypeAlias = tuple[CandidateSet, ...]
 ContactSets: TypeAlias = "tuple[ipctk.NormalCollisions, ...]"
 
-# Young's modulus over k_1 / h (lattice.material)
+# Young's modulus over k_1 / h [-] (lattice.material)
 PER_EDGE = 7 / 4
 
 
@@ -50,7 +50,7 @@ class BarrierLaw:
     distance  : dhat [m]
     stiffness : kappa [J/m^2]
     friction  : Coulomb's mu
-    stick     : slip speed below which friction fades [m/s]
+    stick     : slip speed below which a contact sticks [m/s]
     """
 
     distance: float
@@ -71,8 +71,8 @@ class BarrierLaw:
 
         kappa / dhat^2 is a stiffness per area: the stiffness E / h of a layer of full cells, plus
         its inertia in a step, rho h / t^2. Ando (2024, A cubic barrier with elasticity-inclusive
-        dynamic stiffness) computes both for each contact. Here they are of the stiffest cell and
-        the heaviest node, so that the energy of a state never changes.
+        dynamic stiffness) computes both for each contact. Here the stiffest cell and the heaviest
+        node give both for all contacts, so that the energy depends on positions alone.
 
         distance : dhat [m]
         side     : longest side of the smallest body [m]
@@ -85,10 +85,11 @@ class BarrierLaw:
 
 
 class Barrier:
-    """Barrier of a surface, by positions S (p, 3) [m] of its points.
+    """Barrier of a surface, as a function of positions S (p, 3) [m] of the surface's points.
 
-    bodies : number of points of bodies, which come first; obstacles do not meet each other
-    edge   : mean length of the bodies' edges at rest [m]
+    bodies       : number of points of bodies, which come first; obstacles do not meet each other
+    meets_itself : False if bodies meet obstacles alone
+    edge         : mean length of the bodies' edges at rest [m]
     """
 
     def __init__(self, surface: Surface, law: BarrierLaw, bodies: int, meets_itself: bool = True):
@@ -113,20 +114,20 @@ class Barrier:
         self.edge = float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).mean())
         self.ccd = ipctk.AdditiveCCD()
         self.distances, self.potentials = [law.distance], [self._potential(law.distance)]
-        # Pairs of creases by distance; the first distance has none
+        # Pairs of creases for each distance; dhat, the first, has none
         self.creases: CandidateSets = (CandidateSet(ipctk.Candidates()),)
         # Pairs of creases by kind, with their points (k, 4)
         self._creased: list[list[tuple[list[Any], Indices]]] = []
 
     def _potential(self, distance: float) -> "ipctk.BarrierPotential":
-        """Return the barrier of a distance [m], with the law's stiffness over a depth."""
+        """Return the barrier of a distance [m], with the law's stiffness per area."""
         stiffness = self.law.stiffness * (distance / self.law.distance) ** 2
         return self.ipctk.BarrierPotential(
             self.ipctk.NormalizedClampedLogBarrier(), distance, stiffness
         )
 
     def leave_out_neighbours(self, points: Positions) -> int:
-        """Let pairs in creases push from smaller distances. Return the number of those too close.
+        """Let pairs in creases push from smaller distances. Return the number of pairs too close.
 
         points : (p, 3) at rest [m]
         """
@@ -173,7 +174,10 @@ class Barrier:
         return np.array(sorted(cut), np.int64)
 
     def touching(self, owner: Indices) -> list[tuple[int, int]]:
-        """Return the pairs of bodies closer than dhat at rest, by the body of each point (p,)."""
+        """Return the pairs of bodies that are closer than dhat at rest.
+
+        owner : (p,) number of each point's body
+        """
         mesh, points, body_pairs = self.mesh, self.mesh.rest_positions, set()
         near = self.candidates(points, 0.0)[0].candidates
         for pair in (*near.fv_candidates, *near.ee_candidates):
@@ -188,19 +192,23 @@ class Barrier:
     ) -> CandidateSets:
         """Return the pairs that may come closer than dhat, and all pairs of creases.
 
-        Each point may move by ``margin`` [m] from its place, or from its path by ``moved``.
+        Each point may move by ``margin`` [m] from its place or from its straight path.
 
         points : (p, 3) [m]
-        moved  : (p, 3) [m]; None if points stay
+        moved  : (p, 3) displacements along the paths [m]; None if points stay
         """
         near = self.law.distance + 2 * margin
         pairs = CandidateSet(candidates_on_paths(self.mesh, points, near, moved))
         return pairs, *self.creases[1:]
 
     def around(self, touched: Mask, points: Positions, margin: float) -> CandidateSets:
-        """Return the pairs of parts that have a point in ``touched`` (p,) or next to one.
+        """Return the candidate pairs of parts around points in contact.
 
-        The pairs are valid while points are at most ``margin`` [m] from S (p, 3) [m].
+        An edge or triangle counts if a corner is in ``touched`` or shares an edge with a touched
+        point. The pairs are valid while points are at most ``margin`` [m] from ``points``.
+
+        touched : (p,) bool, the points in contact
+        points  : S (p, 3) [m]
         """
         ipctk, corners, near = self.ipctk, (self.mesh.edges, self.mesh.faces), touched.copy()
         near[corners[0][touched[corners[0]].any(axis=1)]] = True
@@ -227,7 +235,7 @@ class Barrier:
     def clear_margin(self, sets: CandidateSets, points: Positions, margin: float) -> float:
         """Return the displacement [m] of points, at most ``margin``, below which no pair pushes.
 
-        Return 0 if a pair pushes already.
+        The result is 0 if a pair pushes already.
         """
         for pairs, distance in zip(sets, self.distances, strict=True):
             near = self.ipctk.NormalCollisions()
@@ -245,7 +253,7 @@ class Barrier:
     def _pushing(
         self, contacts: ContactSets
     ) -> "list[tuple[ipctk.BarrierPotential, ipctk.NormalCollisions]]":
-        """Return the nonempty sets, each with its barrier."""
+        """Return the sets that are not empty, each with its barrier."""
         kinds = zip(self.potentials, contacts, strict=False)
         return [(potential, pairs) for potential, pairs in kinds if not pairs.empty()]
 
@@ -266,7 +274,10 @@ class Barrier:
     def hessian(
         self, contacts: ContactSets, points: Positions, projected: bool
     ) -> "list[csc_matrix]":
-        """Return the terms (3p, 3p) [N/m] of the Hessian, projected pair by pair or not."""
+        """Return the Hessian's terms (3p, 3p) [N/m], a term for each set that is not empty.
+
+        projected : project the Hessian of each pair to be positive semidefinite
+        """
         kinds, at = self.ipctk.PSDProjectionMethod, np.asfortranarray(points)
         if not projected:
             return [
@@ -283,10 +294,10 @@ class Barrier:
     def friction(
         self, contacts: ContactSets, points: Positions, start: Positions, stick: float
     ) -> SurfaceFriction | None:
-        """Return Coulomb's friction by the normal forces at points (p, 3) [m], or None.
+        """Return Coulomb friction with the normal forces at points (p, 3) [m]; None without pairs.
 
         start : (p, 3) positions of points without slip [m]
-        stick : slip below which friction fades [m]
+        stick : slip below which a pair sticks [m]
         """
         pairs = self._friction_pairs(contacts, points)
         if not len(pairs.push):
@@ -295,7 +306,7 @@ class Barrier:
         return SurfaceFriction(limit, stick, np.zeros((1, 3)), start, pairs.numbers, slips)
 
     def friction_limits(self, contacts: ContactSets, points: Positions) -> tuple[Indices, Floats]:
-        """Return points (a, 4) of pairs, -1 for none, and mu N (a,) [N] at points (p, 3) [m]."""
+        """Return the points (a, 4) of pairs, -1 for none, and mu N (a,) [N], at points (p, 3)."""
         pairs = self._friction_pairs(contacts, points)
         return pairs.numbers, self.law.friction * pairs.push
 
@@ -308,7 +319,7 @@ class Barrier:
         return friction_pairs(collisions, self.mesh)
 
     def least(self, contacts: ContactSets, points: Positions) -> float:
-        """Return the least distance [m]; infinite without contacts."""
+        """Return the least distance [m] of contacts; infinite without contacts."""
         return min(
             (self._least(pairs, points) for _, pairs in self._pushing(contacts)), default=np.inf
         )
@@ -317,7 +328,7 @@ class Barrier:
         return float(np.sqrt(pairs.compute_minimum_distance(self.mesh, np.asfortranarray(points))))
 
     def nearest(self, contacts: ContactSets, points: Positions) -> Indices:
-        """Return the points (k,) of the closest pair; none without contacts."""
+        """Return the numbers (k,) of the closest pair's points; empty without contacts."""
         parts, at = (self.mesh.edges, self.mesh.faces), np.asfortranarray(points)
         pairs = [near[i] for _, near in self._pushing(contacts) for i in range(len(near))]
         nearest = min(pairs, key=lambda pair: pair.compute_distance(at, *parts), default=None)

@@ -1,4 +1,4 @@
-"""Surface that meets itself and obstacles: the surface of the bodies or a coarser surface.
+"""Construction of the contact surface: the bodies' own surface or a coarser surface, and obstacles.
 
 Triangles that cross at rest are left out.
 """
@@ -26,20 +26,20 @@ from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.obstacles import SelfContactTable
 from msmpetsc.scene.reading import Scene
 
-# Least default distance, as a share of the bounding box's diagonal
+# Least default distance [largest diagonal of a body's bounding box]
 NEAR = 3e-4
-# Default distance [cells]; a thinner barrier sees impacts late and takes more
-# iterations, a wider barrier makes presses stiffer (scripts/results/impact.md)
+# Default distance, before gaps at rest reduce it [cells]; a thinner barrier detects
+# impacts late and takes more iterations, a wider barrier stiffens pressed contacts
+# (scripts/results/impact.md)
 SHARE = 1 / 24
-# Most triangles that may be left out, as a share of all; with more of them left out,
-# little would keep the rest apart
+# Greatest share of triangles that may be left out [-]; if more were left out, too few
+# would keep bodies apart
 MOST_CUT = 0.1
 # Edge length beyond which a triangle is long [cells]
 LONG = 2.0
-# Fewest triangles of a body
+# Fewest triangles of a coarser body
 FEWEST = 20
-# Speed of the decimation; with its default, 7, the coarser surface is two to four times
-# as far off
+# Speed of the decimation; its default, 7, gives a surface two to four times as far off
 HASTE = 4
 
 
@@ -50,14 +50,14 @@ def collision_surface(
     lattice: Lattice,
     obstacles: list[Obstacle],
 ) -> CollisionSurface | None:
-    """Return the contact surface of all bodies and obstacles (collective).
+    """Return the contact surface of all bodies and of obstacles with a barrier (collective).
 
-    Return None if the scene asks for neither.
+    Return None if the scene has neither self-contact nor an obstacle with a barrier.
 
     obstacles : in the scene's order
 
-    Raises InputError on all ranks if over a tenth of the triangles cross at rest, and if an
-    obstacle cuts a body.
+    Raises InputError on all ranks if over a tenth of the triangles cross at rest, or if an
+    obstacle cuts or nearly touches a body.
     """
     table, comm = scene.touching, bodies[0].comm
     if table is None:
@@ -93,9 +93,9 @@ def _prepared(
 ) -> tuple[list[Surface], float, float]:
     """Return the contact surfaces, their distance from the bodies' surfaces, and their mean edge.
 
-    The surfaces have about as many triangles as the table asks for; all triangles if it names no
-    number. Triangles that cross, or name a point twice, are left out. The distance is the median
-    over the bodies' points [m].
+    The surfaces have about as many triangles as ``table.surface`` says, or all triangles without
+    it. Triangles that name a point twice are left out. If the bodies meet themselves, crossing
+    triangles are left out, too. The distance is the median over the bodies' points [m].
 
     Raises InputError if too many triangles cross.
     """
@@ -112,8 +112,8 @@ def _prepared(
         bodies, off = coarser, _off(bodies, coarser, table.distance or 0.0)
     if meets_itself:
         longest = max(float(np.linalg.norm(np.ptp(body.points, axis=0))) for body in bodies)
-        # Points within ON_PLANE of a plane of the grid snap to it, which would close a
-        # smaller gap
+        # Points within ON_PLANE of a plane of the grid snap to the plane, which would
+        # close a smaller gap
         gap = max(NEAREST * (table.distance or NEAR * longest), 2 * ON_PLANE * longest)
         bodies = _without_crossing_triangles(_parted(bodies, gap), table.surface is not None)
     ends = np.concatenate(
@@ -128,12 +128,11 @@ def _prepared(
 def _gap(
     comm: MPI.Comm, surface: Surface | None, widest: float, bodies: int, meets_itself: bool
 ) -> float:
-    """Return the least distance [m] at rest of parts that may touch, at most ``widest``
-    (collective).
+    """Return the least rest distance [m] of parts that may touch, at most ``widest`` (collective).
 
-    A wider barrier would throw apart bodies that a scene puts side by side.
+    A barrier wider than this gap would throw apart bodies that a scene puts side by side.
 
-    surface : on rank 0
+    surface : all surfaces in contact, on rank 0
     bodies  : number of the bodies' points, which come first
     """
 
@@ -168,7 +167,7 @@ def _refuse_touching(surface: CollisionSurface) -> None:
 
 
 def _place(surface: Surface, triangle: int) -> str:
-    """Return the centre of a triangle, in words."""
+    """Return the centre of a triangle as text."""
     middle = surface.points[surface.triangles[triangle]].mean(axis=0)
     return "(" + ", ".join(f"{c:.4g}" for c in middle) + ")"
 
@@ -176,7 +175,7 @@ def _place(surface: Surface, triangle: int) -> str:
 def _parted(bodies: list[Surface], gap: float) -> list[Surface]:
     """Return the surfaces, drawn in by ``gap`` [m] if any two bodies are closer at rest.
 
-    The barrier needs a distance.
+    A barrier needs a gap.
     """
     whole = joined(bodies)
     assert whole is not None
@@ -195,7 +194,7 @@ def _parted(bodies: list[Surface], gap: float) -> list[Surface]:
 def _without_crossing_triangles(bodies: list[Surface], are_coarser: bool) -> list[Surface]:
     """Return surfaces without crossing triangles. Raises InputError if too many cross.
 
-    are_coarser : whether the surfaces are coarser than the mesh, which may make them cross
+    are_coarser : whether the surfaces are coarser than the mesh, so that they may cross
     """
     whole = joined(bodies)
     assert whole is not None
@@ -221,7 +220,7 @@ def _without_crossing_triangles(bodies: list[Surface], are_coarser: bool) -> lis
 def _off(bodies: list[Surface], coarser: list[Surface], distance: float) -> float:
     """Return the median distance [m] of the bodies' points from the coarser surfaces.
 
-    Warn if the greatest distance shows that a part was lost.
+    Warn if a point is farther from them than ``distance`` [m].
     """
     import igl
 
@@ -243,10 +242,10 @@ def _off(bodies: list[Surface], coarser: list[Surface], distance: float) -> floa
 
 
 def _warn_of_long_triangles(longest: float, length: float) -> None:
-    """Warn of an edge that is much longer than a length [m].
+    """Warn if the longest edge is much longer than ``length`` [m].
 
-    Only the points of the surface follow the body. Two cubes of twelve triangles touch at their
-    corners, and bulges between the corners pass through each other.
+    Only the points of the surface follow the body. If two cubes of twelve triangles touch at their
+    corners, bulges between the corners pass through each other.
     """
     if longest > LONG * length:
         log.warning(
@@ -259,9 +258,9 @@ def _warn_of_long_triangles(longest: float, length: float) -> None:
 
 
 def _coarser(surface: Surface, triangles: int) -> Surface:
-    """Return a surface of about so many triangles with its points on the given surface.
+    """Return a surface of about ``triangles`` triangles, with its points on the given surface.
 
-    So its points lie in the cells of the body.
+    The points then lie in cells of the body.
     """
     import igl
 

@@ -2,8 +2,8 @@
 
 The broad phase finds the pairs that may meet on the paths. The narrow phase is ipctk's additive CCD
 (Li, Kaufman and Jiang 2021, Codimensional Incremental Potential Contact). A translation that all
-points have in common is left out. The function ``collision_free_step`` takes paths with known
-candidates, ``sweep`` takes long paths piece by piece.
+points share is ignored. ``collision_free_step`` takes paths whose candidates are known. ``sweep``
+takes paths of any length, piece by piece.
 """
 
 from typing import TYPE_CHECKING
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 
     from msmpetsc.contact.surface.barrier import Barrier, CandidateSets
 
-# Share of the path to a crossing that a step takes
+# Share of the path to a crossing that a step takes [-]
 TAKEN = 0.9
-# Edges that points move in a piece of a long path
+# Displacement of points in a piece of a long path [mean edges]
 PIECE = 2.0
-# Most pieces of a path; a longer path is shortened
+# Greatest number of pieces of a path; a longer path is shortened
 PIECES = 200
-# Greatest linear part of displacements that boxes leave out; the allowance for a larger
+# Greatest norm of the linear part that boxes leave out [-]; the allowance for a larger
 # part would enlarge the boxes
 STRETCHED = 0.2
 
@@ -31,15 +31,14 @@ STRETCHED = 0.2
 def candidates_on_paths(
     mesh: "ipctk.CollisionMesh", points: Positions, near: float, moved: Rows | None
 ) -> "ipctk.Candidates":
-    """Return the pairs that may come closer than ``near`` on the paths of points by ``moved``.
+    """Return the pairs that may come closer than ``near`` [m] on the straight paths of points.
 
-    The linear part of the displacements, m = c + G x + r, would enlarge the boxes around paths. If
-    a pair is closer than d on its path, ``|x - x' + t (r - r')| < d + |G| |x - x'|``. Hence
+    Displacements are m = c + G x + r. Their linear part G x would enlarge the boxes around paths.
+    If a pair is closer than d on its path, ``|x - x' + t (r - r')| < d + |G| |x - x'|``. Hence
     ``|x - x'| < (d + 2 max |r|) / (1 - |G|)``, and boxes around r suffice.
 
     points : (p, 3) [m]
-    near   : [m]
-    moved  : (p, 3) [m]; None if points stay
+    moved  : (p, 3) displacements along the paths [m]; None if points stay
     """
     import ipctk
 
@@ -55,7 +54,7 @@ def candidates_on_paths(
 def _without_linear_part(points: Positions, moved: Rows) -> tuple[Rows, float]:
     """Return displacements (p, 3) [m] without their linear part, and the norm of that part.
 
-    A linear part above STRETCHED stays, and its norm counts as 0.
+    If the norm is STRETCHED or more, the linear part stays, and the norm returned is 0.
     """
     x, rest = points - points.mean(axis=0), moved - moved.mean(axis=0)
     linear = np.linalg.pinv(x.T @ x, hermitian=True) @ (x.T @ rest)
@@ -75,7 +74,12 @@ def collision_free_step(
 
 
 def sweep(barrier: "Barrier", start: Positions, moved: Rows) -> float:
-    """Return the collision-free step length of any paths, with new candidates for each piece."""
+    """Return the collision-free step length, at most 1, of paths of any length.
+
+    Each piece of the paths has its own candidates. A step length covers PIECES pieces at most.
+
+    start, moved : positions and displacements (p, 3) [m]
+    """
     moved = moved - moved.mean(axis=0)
     whole = max(
         int(np.ceil(float(np.sqrt((moved**2).sum(axis=1).max())) / (PIECE * barrier.edge))), 1
@@ -92,7 +96,7 @@ def sweep(barrier: "Barrier", start: Positions, moved: Rows) -> float:
 def _share_to_crossing(
     barrier: "Barrier", start: Positions, end: Positions, sets: "CandidateSets"
 ) -> float:
-    """Return the share of paths before the first crossing of candidate pairs."""
+    """Return the share of paths, at most 1, before the first crossing of candidate pairs."""
     paths = barrier.mesh, np.asfortranarray(start), np.asfortranarray(end), 0.0, barrier.ccd
     shares = (
         pairs.candidates.compute_collision_free_stepsize(*paths) for pairs in sets if len(pairs)

@@ -1,8 +1,8 @@
-"""Pairs of a surface's parts in its creases, which push each other from smaller distances.
+"""Pairs in creases of a surface, which push from distances smaller than dhat.
 
-Parts that are closer than dhat at rest and at most a few rings of triangles apart are one piece of
-surface. Each of their pairs pushes from the greatest of dhat, dhat / 4, dhat / 16, ... that is at
-most half of its distance at rest. So the pair does nothing at rest and still cannot cross. Parts
+A crease has parts that are closer than dhat at rest and at most RINGS rings of triangles apart.
+Each pair of a crease pushes from the greatest of dhat, dhat / 4, dhat / 16, ... that is at most
+half of the pair's distance at rest. So the pair has no force at rest and still cannot cross. Parts
 farther apart on the surface push from dhat, however close they are at rest.
 """
 
@@ -17,30 +17,32 @@ from msmpetsc.backend.arrays import Indices, Positions
 if TYPE_CHECKING:
     import ipctk
 
-# Most rings of triangles between neighbours
+# Greatest number of rings of triangles between neighbours
 RINGS = 3
-# Ratio of successive distances
+# Ratio of successive distances [-]
 FINER = 4
-# Least ratio of a pair's distance at rest to the distance from which it pushes
+# Least ratio of a pair's distance at rest to the distance from which it pushes [-]
 ROOM = 2.0
-# Share of dhat; pairs that are closer at rest may cross
+# Least distance at rest [dhat]; closer pairs are left out and may cross
 NEAREST = 1e-3
 
 
 def neighbours(
     candidates: "ipctk.Candidates", mesh: "ipctk.CollisionMesh", points: Positions, distance: float
 ) -> Mapping[tuple[int, int], bool]:
-    """Return {(i, j): False}, i < j, for points of neighbours, which push from smaller distances.
+    """Return {(i, j): False}, i < j, for points of neighbours, in the form of ipctk's filter.
 
-    Neighbours are candidate pairs closer than ``distance`` [m] at rest, with parts at most RINGS
-    rings of triangles apart.
+    Neighbours are candidate pairs that are closer than ``distance`` [m] at rest, with parts at most
+    RINGS rings of triangles apart.
+
+    points : (p, 3) [m] at rest
     """
     at = np.asfortranarray(points), mesh.edges, mesh.faces
     kinds = (
         (candidates.fv_candidates, [(0, 1), (0, 2), (0, 3), (0, 3)]),
         (candidates.ee_candidates, [(0, 2), (0, 3), (1, 2), (1, 3)]),
     )
-    # (k, 4, 2) points of candidates that are near, one of either part
+    # (k, 4, 2) pairs of points, one of each part, of candidates that are near
     near = (
         np.reshape(
             [c.vertex_ids(*at[1:]) for c in kind if c.compute_distance(*at) < distance**2], (-1, 4)
@@ -69,12 +71,12 @@ def creases(
     points: Positions,
     distance: float,
 ) -> tuple[dict[float, "ipctk.Candidates"], int]:
-    """Return the pairs of creases by their distance [m], and the number of pairs too close for any.
+    """Return the pairs of creases by their distance [m], and the number of pairs too close.
 
-    The greatest distance comes first. A pair is a point and a triangle, or two edges. Each point of
-    one part is a neighbour of each point of the other.
+    The greatest distance comes first. A pair is a point and a triangle, or two edges. All points of
+    its first part are neighbours of all points of its second part.
 
-    near     : {(i, j): False} of the points of neighbours
+    near     : {(i, j): False} for points of neighbours
     points   : (p, 3) [m] at rest
     distance : dhat [m]
     """

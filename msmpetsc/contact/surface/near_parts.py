@@ -1,8 +1,8 @@
 """Nearest places of candidate pairs, and places that link pairs (contact.surface.places).
 
 A place is where two parts of the surface are nearest: two vertices, an edge and a vertex, a
-triangle and a vertex, or two edges. The number of a place holds its kind, the numbers of its two
-parts and ipctk's type of the distance of two edges.
+triangle and a vertex, or two edges. The number of a place encodes its kind, its two parts and, for
+two edges, ipctk's type of their distance.
 """
 
 import math
@@ -23,24 +23,24 @@ TYPES = np.array([[0, 1, 6], [2, 3, 7], [0, 2, 4], [1, 3, 5]])
 BETWEEN = 2
 # ipctk's type if both nearest points are between the ends.
 CROSSING = 8
-# Squared sine between two edges, by their lengths at rest, below which their barrier
-# fades out; ipctk's value.
+# Squared sine between two edges, with their lengths at rest, below which their barrier
+# fades out [-]; ipctk's value.
 PARALLEL = 1e-3
-# Squared sine below which rounding decides the common normal of two edges.
+# Squared sine below which rounding decides the common normal of two edges [-].
 NO_NORMAL = 1e-12
 TINY = float(np.finfo(float).tiny)
 
 
 class Mesh(NamedTuple):
-    """Mesh at rest.
+    """Mesh at rest, as kernels take it.
 
-    Areas are a quarter of ipctk's, since the vertices and the edges of both surfaces push.
+    Areas are a quarter of ipctk's, since vertices and edges of both surfaces push.
 
     edges, faces             : vertices (e, 2), (f, 3)
     sides                    : edges (f, 3) of triangles
     vertex_areas, edge_areas : (v,), (e,) [m^2]
     squares                  : squared lengths (e,) of edges [m^2]
-    size                     : more than any number of a vertex, an edge or a triangle
+    size                     : greater than every number of a vertex, an edge or a triangle
     """
 
     edges: Indices
@@ -59,7 +59,7 @@ class Parts(NamedTuple):
     weight : area [m^2]
     pair   : number of the pair; two numbers for a pair of edges; -1 for a nearest place
     shared : parts with equal numbers link their pairs
-    value  : b of a link; infinite for a nearest place
+    value  : b of a link, for the maximum spanning forest; infinite for a nearest place
     """
 
     place: Indices
@@ -156,7 +156,7 @@ def _crossing(first: Vector, second: Vector, offset: Vector) -> tuple[float, flo
 def add_faces(pairs: Indices, mesh: Mesh, points: Positions, limit: float, parts: Parts) -> int:
     """Write the parts of pairs (2, k) of a triangle and a vertex. Return the number of parts.
 
-    limit : squared distance [m^2]; pairs at it or beyond have no parts
+    limit : squared distance [m^2]; pairs at this distance or beyond have no parts
     """
     n = 0
     for i in range(pairs.shape[1]):
@@ -186,7 +186,7 @@ def add_edges(
 ) -> int:
     """Write the parts of pairs (2, k) of edges, from part n on. Return the number of all parts.
 
-    limit : squared distance [m^2]; pairs at it or beyond have no parts
+    limit : squared distance [m^2]; pairs at this distance or beyond have no parts
     """
     for i in range(pairs.shape[1]):
         one, other, pair = pairs[0, i], pairs[1, i], n

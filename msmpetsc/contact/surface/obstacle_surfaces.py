@@ -14,29 +14,29 @@ from msmpetsc.geometry.surface import Surface
 from msmpetsc.scene.obstacles import BARRIER, ObstacleTable
 from msmpetsc.scene.reading import Scene
 
-# Longest edge of an obstacle, in edges of the bodies; larger triangles would push
+# Longest edge of an obstacle [mean edges of the bodies]; larger triangles would push
 # stiffly
 LONGEST_EDGE = 4.0
-# Triangles of an obstacle beyond which it is not split
+# Number of triangles from which an obstacle is not split further
 MOST_TRIANGLES = 10_000
-# Subdivisions of an icosahedron; it is then 5e-4 of its radius off the ball
+# Subdivisions of an icosahedron; it then differs from the ball by 5e-4 of the radius
 ROUND = 4
-# Distance within which nodes move with an obstacle [cells]; farther off this fades out,
-# over as many displacements of the obstacle, or over as many cells if that is longer
+# Distance within which nodes move with an obstacle [cells]. The motion fades out over a
+# further NEARBY displacements of the obstacle, or NEARBY cells if that is longer.
 NEARBY = 4.0
-# Least distance of inverse distances [cells]
+# Least distance to divide by [cells]
 TOUCHING = 1e-9
 
 
 @dataclass
 class ObstacleSurfaces:
-    """Surfaces of obstacles, on all ranks, in a single sequence of points.
+    """Surfaces of obstacles on all ranks. The points of all surfaces form a single sequence.
 
-    numbers   : (k,) of the obstacles in the scene
-    obstacles : with their paths
+    numbers   : (k,) numbers of the obstacles in the scene
+    obstacles : the obstacles, with their paths
     solids    : surfaces of the obstacles at time 0
-    straight  : times [s] between which points move along straight lines in place of their paths;
-                None: never
+    straight  : times [s] between which points move on straight lines instead of their paths; None
+                for never
     """
 
     numbers: list[int]
@@ -70,9 +70,9 @@ class ObstacleSurfaces:
         return np.concatenate([each.path.moved(solid.points, pose) for each, solid, pose in posed])
 
     def displacements(self, begin: float, end: float) -> Rows:
-        """Return displacements (o, 3) [m] of the points between two times [s].
+        """Return the points' displacements (o, 3) [m] between two times [s]; (1, 3) zeros at rest.
 
-        Return zeros (1, 3) if all are at rest.
+        Obstacles are at rest if none moves between the times.
         """
         return (
             self.points_at(end) - self.points_at(begin)
@@ -81,16 +81,17 @@ class ObstacleSurfaces:
         )
 
     def displacements_before(self, begin: float, end: float) -> Rows:
-        """Return displacements (o, 3) [m] in a step before ``begin``, of the rates of a step.
+        """Return displacements (o, 3) [m] in a step before ``begin``, extrapolated from the step.
 
-        Paths go back from begin as straight as they go to end [s]: a kink at begin does not count.
+        Poses at ``begin`` and ``end`` [s] are extrapolated linearly to the step before, so a kink
+        of a path at ``begin`` has no effect.
         """
         poses = [(o.path.value_at(begin), o.path.value_at(end)) for o in self.obstacles]
         before = [2 * at_begin - at_end for at_begin, at_end in poses]
         return self._posed([at_begin for at_begin, _ in poses]) - self._posed(before)
 
     def sums(self, forces: Rows) -> Rows:
-        """Return the total force (k, 3) [N] on each obstacle, by forces (o, 3) [N] on points."""
+        """Return the total force (k, 3) [N] on each obstacle, from forces (o, 3) [N] on points."""
         owner = np.repeat(np.arange(len(self.solids)), [len(solid.points) for solid in self.solids])
         return np.stack([np.bincount(owner, along, len(self.solids)) for along in forces.T], axis=1)
 
@@ -102,13 +103,16 @@ class ObstacleSurfaces:
     def carried(
         self, q: Positions, moved: Rows, times: tuple[float, float], distances: Rows, cell: float
     ) -> Rows:
-        """Return displacements (n, 3) [m] of nodes q (n, 3) between two times [s], with obstacles.
+        """Return displacements (n, 3) [m] of nodes q (n, 3) [m] that obstacles carry along.
 
-        Nodes at an obstacle move with it. Between obstacles displacements are interpolated by
-        inverse distances, so that a plate and a floor squeeze a body evenly. Farther off,
-        displacements fade to ``moved`` (n, 3) [m].
+        A node at an obstacle moves with the obstacle. Between obstacles, inverse distances
+        interpolate the displacements, so that a plate and a floor squeeze a body evenly. Farther
+        off, displacements fade to ``moved``.
 
-        distances : of each node from each obstacle (n, k) [m]
+        moved     : (n, 3) displacements far from obstacles [m]
+        times     : begin and end of the obstacles' motion [s]
+        distances : (n, k) of each node from each obstacle [m]
+        cell      : side of a cell [m]
         """
         weights, near = np.zeros((len(q), 1)), np.zeros((len(q), 1))
         carried = np.zeros_like(q)
@@ -125,7 +129,10 @@ class ObstacleSurfaces:
 
 
 def obstacle_surfaces(scene: Scene, obstacles: list[Obstacle], edge: float) -> ObstacleSurfaces:
-    """Return the surfaces of barrier obstacles, for bodies with edges of this mean length [m]."""
+    """Return the surfaces of barrier obstacles.
+
+    edge : mean length of the bodies' edges [m]
+    """
     numbers = [number for number, table in enumerate(scene.obstacle) if table.response == BARRIER]
     met = [obstacles[number] for number in numbers]
     whole = (_surface_of(scene.obstacle[number], obstacles[number]) for number in numbers)
@@ -133,7 +140,7 @@ def obstacle_surfaces(scene: Scene, obstacles: list[Obstacle], edge: float) -> O
 
 
 def _surface_of(table: ObstacleTable, obstacle: Obstacle) -> Surface:
-    """Return the surface of a mesh as it is, of a box or of a ball with few triangles."""
+    """Return the surface of an obstacle: its mesh, a box of twelve triangles, or an icosphere."""
     if isinstance(obstacle.solid, DistanceSolid):
         return obstacle.solid.surface(*np.zeros((2, 3)))
     if table.radius is not None:
@@ -144,9 +151,9 @@ def _surface_of(table: ObstacleTable, obstacle: Obstacle) -> Surface:
 
 
 def _split(surface: Surface, longest: float) -> Surface:
-    """Return a surface with no edge longer than this [m], or of MOST_TRIANGLES triangles.
+    """Return the surface, split until no edge is longer than ``longest`` [m].
 
-    The longest edge of each triangle is halved.
+    A split halves the longest edge of each long triangle. Splits end at MOST_TRIANGLES triangles.
     """
     points = surface.points
     triangles = surface.triangles

@@ -1,9 +1,9 @@
-"""Contacts of a surface with itself and with obstacles, with candidate pairs cached.
+"""Candidate contact pairs of a surface, cached so that the broad phase runs rarely.
 
 The broad phase finds candidate pairs at given positions. The pairs are valid until a point has
-moved by more than a margin; a common translation does not count. A bound by displacements of nodes
-comes first: if no candidate pair can come near, no point is computed. Otherwise the points decide,
-since light nodes around a body swing much farther than its points.
+moved by more than a margin; a translation of all points does not count. A bound from displacements
+of nodes is tested first. If it shows that no pair can push, the points are not computed. Otherwise
+displacements of points decide, since light nodes around a body swing much farther than its points.
 
 Candidate pairs outlive a step (``CandidateCache``). Contacts at positions are kept during a step
 (``ContactSearch``). If few points touch, a step is narrow: it uses the candidates around these
@@ -23,17 +23,18 @@ from msmpetsc.contact.surface.creases import NEAREST
 from msmpetsc.contact.surface.points import SurfacePoints
 from msmpetsc.geometry.surface import Surface
 
-# Positions whose contacts and candidates are kept: the base of a line search and its
-# trials
+# Number of positions whose contacts and candidates are kept: the base of a line search
+# and its trials
 REMEMBERED = 3
-# Edges that a point may move before a new broad phase; with fewer the pairs are not
-# fewer, and 0.25 has four times the pairs
+# Margin of candidate pairs: displacement of a point before a new broad phase [mean
+# edges]; a smaller margin does not give fewer pairs, 0.25 gives four times as many
 REACH = 0.02
-# Edges that a point may move in a narrow step
+# Margin of candidate pairs in a narrow step [mean edges]
 FARTHEST = 0.05
-# Share of points in contact beyond which second solves cost more than narrow steps save
+# Share of points in contact from which second solves cost more than narrow steps save
+# [-]
 FEW = 0.01
-# Relative difference of two sums of contact energy by rounding
+# Relative difference of two sums of contact energy that counts as rounding [-]
 SAME_ENERGY = 1e-9
 TINY = np.finfo(float).tiny
 
@@ -42,9 +43,10 @@ TINY = np.finfo(float).tiny
 class CollisionSurface:
     """Surface of bodies and obstacles in contact.
 
-    surface      : of bodies without crossing triangles, then of obstacles; on rank 0, else None
+    surface      : surface of bodies without crossing triangles, then of obstacles, on rank 0; None
+                   elsewhere
     points       : W, from positions of nodes to points of the surface
-    meets_itself : whether the surface meets itself, too; if not, it meets obstacles alone
+    meets_itself : False if bodies meet obstacles alone
     parts        : name and number of points of each body and obstacle, on rank 0
     """
 
@@ -73,11 +75,11 @@ class ContactSummary:
 class CandidatePairs:
     """Candidate pairs that are valid while points stay within a margin of their places or paths.
 
-    A common translation of all points does not count.
+    A translation of all points does not count.
 
     q      : positions (owned, 3) [m] of the broad phase
-    time   : of the places of obstacles [s]
-    margin : [m]
+    time   : time [s] of the obstacles' places
+    margin : greatest displacement of a point [m]
     clear  : displacement [m], at most the margin, below which no pair pushes
     points : S (p, 3) [m] at q, on rank 0
     sets   : candidate pairs, on rank 0
@@ -105,11 +107,11 @@ class CandidatePairs:
 class SurfaceContactsAt:
     """Contacts at positions and a time of obstacles.
 
-    q        : (owned, 3) [m]
-    time     : [s]
+    q        : (owned, 3) positions [m]
+    time     : time [s] of the obstacles' places
     count    : number of contacts
-    points   : S (p, 3) [m], on rank 0; empty if nothing was near
-    contacts : on rank 0; empty if nothing was near
+    points   : S (p, 3) [m], on rank 0; empty if nothing is near
+    contacts : the pairs that push, on rank 0; empty if nothing is near
     """
 
     q: Positions
@@ -120,7 +122,7 @@ class SurfaceContactsAt:
 
 
 class CandidateCache:
-    """Cache of candidate pairs of a run.
+    """Cache of a run's candidate pairs.
 
     All methods are collective. Positions are (owned or more, 3) [m].
 
@@ -140,11 +142,14 @@ class CandidateCache:
         self._known: list[CandidatePairs] = []
 
     def around(self, q: Positions, time: float) -> CandidatePairs:
-        """Return the newest candidates, or those at q if there are none yet."""
+        """Return the newest candidates; if there are none yet, find candidates at q."""
         return self._known[0] if self._known else self.broad_phase(q, time)
 
     def valid_at(self, *places: Positions) -> CandidatePairs | None:
-        """Return the newest candidates that are valid at all these points (p, 3) [m], or None."""
+        """Return the newest candidates that are valid at all ``places``, or None.
+
+        places : points (p, 3) [m]
+        """
         known = enumerate(self._known if self.barrier else ())
         number: int | None = self.comm.bcast(
             next((i for i, pairs in known if all(map(pairs.is_valid_at, places))), None)
@@ -155,7 +160,7 @@ class CandidateCache:
         return self._known[0]
 
     def broad_phase(self, q: Positions, time: float, moved: Rows | None = None) -> CandidatePairs:
-        """Find candidate pairs at q, or on the paths from there by ``moved`` (p, 3) [m]."""
+        """Find candidate pairs at q, or on paths from q by ``moved`` (p, 3) [m], and cache them."""
         points, margin = self.points(q, time), REACH * self.edge
         sets: CandidateSets = ()
         clear = 0.0
@@ -169,18 +174,21 @@ class CandidateCache:
         return newest
 
     def farthest(self, end: Positions, start: Positions, time: float, begin: float) -> float:
-        """Return a bound [m] of points' displacements from start to end, without a translation."""
+        """Return a bound [m] of points' displacements from start to end, without a translation.
+
+        begin, time : times [s] of the obstacles at start and end
+        """
         moved = end[: self.owned] - start[: self.owned]
         if self.points.obstacles.total:
             moved = np.vstack([moved, self.points.obstacles.displacements(begin, time)])
-        # numpy reduces along the last axis twenty times as fast
+        # numpy reduces fastest along the last axis
         along = np.ascontiguousarray(moved.T)
         ends = [
             np.fmax.reduce(along, axis=1, initial=-np.inf),
             -np.fmin.reduce(along, axis=1, initial=np.inf),
         ]
         ends = np.concatenate(ends)
-        # The greatest along the axes and against them
+        # Greatest displacements along the axes and against them
         self.comm.Allreduce(MPI.IN_PLACE, ends, MPI.MAX)
         return float(self.points.spread * 0.5 * np.linalg.norm(ends[:3] + ends[3:]))
 
@@ -195,8 +203,8 @@ class ContactSearch:
     Positions are (owned or more, 3) [m]. Obstacles have their places at the end of the step unless
     another time is given.
 
-    before      : contacts of the last step, whose end is known
-    is_narrow   : whether only candidates around some contacts are used
+    before      : contacts of the last step, which ended where this step begins
+    is_narrow   : whether only candidates around known contacts are used
     is_left_out : whether the step is narrow without contacts, so that the surface is left out
     """
 
@@ -225,7 +233,7 @@ class ContactSearch:
     ) -> SurfaceContactsAt:
         """Return the contacts at positions q.
 
-        time        : of obstacles [s]; None for the end of the step
+        time        : time [s] of obstacles; None for the end of the step
         with_points : compute the points even if nothing is near
         """
         q, time = q[: self.owned], self.time if time is None else time
@@ -251,7 +259,7 @@ class ContactSearch:
     def narrow(self, q: Positions, time: float) -> bool:
         """Use only candidates around the contacts at q and a time [s], and around earlier contacts.
 
-        If too many points touch, use all candidates. Return whether the step is narrow.
+        Return whether the step is narrow. If too many points touch, the step uses all candidates.
         """
         moment, touched = self.find(q, time), None
         if self.barrier and moment.count:
@@ -269,15 +277,15 @@ class ContactSearch:
         return self.is_narrow
 
     def widen(self) -> None:
-        """Use all candidates."""
+        """Use all candidates from now on."""
         self.is_narrow, self.is_left_out, self._moments = False, False, []
 
     def check_narrow_step(self, q: Positions, x: Positions, left_out: float) -> tuple[bool, bool]:
         """Return whether the path of a narrow step from q to x is free, and whether x is right.
 
         The solution x is right if the contact energy of all pairs is within ``left_out`` [J] of the
-        energy of the pairs used. From then on all candidates are used. If the path is free and x is
-        not right, the step stays narrow, with the candidates around all contacts at x.
+        energy of the pairs used. Afterwards the step uses all candidates. But if the path is free
+        and x is not right, the step stays narrow, with the candidates around all contacts at x.
         """
         known = ContactSummary() if self.is_left_out else self.touch(x, self.time)
         self.widen()
@@ -300,7 +308,7 @@ class ContactSearch:
         return self._points[0][2]
 
     def _is_at(self, known: Positions, at: float, q: Positions, time: float) -> bool:
-        """Return whether positions and obstacles' places equal known ones on all ranks."""
+        """Return whether positions and obstacles' places equal known places on all ranks."""
         return self.same(at, time) and reduced(self.comm, bool(np.array_equal(q, known)), MPI.LAND)
 
     def same(self, begin: float, end: float) -> bool:
@@ -320,7 +328,7 @@ class ContactSearch:
         return of_all
 
     def nearest(self, q: Positions) -> str:
-        """Return in words which two parts of the surface are nearest at q, and their place."""
+        """Return a text that names the two nearest parts of the surface at q, and their place."""
         moment, words = self.find(q, with_points=True), ""
         if self.barrier:
             points = self.barrier.nearest(moment.contacts, moment.points)
@@ -337,7 +345,7 @@ class ContactSearch:
     def _bound(self, q: Positions, begin: float, end: Positions) -> tuple[CandidatePairs, float]:
         """Return the newest candidates and a bound [m] of points' distances from their places.
 
-        The bound holds on the path from q at ``begin`` [s] to ``end``.
+        The bound holds on the whole path from q at ``begin`` [s] to ``end``.
         """
         pairs = self.near.around(q, begin)
         places = (q, begin), (end, self.time)
@@ -384,7 +392,7 @@ class ContactSearch:
 
 
 def farthest(moved: Rows) -> float:
-    """Return the greatest displacement [m] of ``moved`` (p, 3) [m] without a translation."""
+    """Return the greatest displacement [m] of ``moved`` (p, 3) [m] from the middle of its range."""
     along = np.ascontiguousarray(moved.T)
     middle = 0.5 * (along.max(axis=1) + along.min(axis=1))
     return float(np.sqrt(((along - middle[:, None]) ** 2).sum(axis=0).max()))

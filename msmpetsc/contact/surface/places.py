@@ -11,12 +11,12 @@ triangles, in a maximum spanning forest of these triangles. A link's b is at mos
 triangle. The energy is thus
 
 - at least the energy of the nearest triangle: never negative, and unbounded at distance 0;
-- continuous, because it is the minimum over all forests of sums that are smooth;
+- continuous, because it is the minimum, over all forests, of smooth sums;
 - the energy of the nearest triangle alone if v is over a flat or convex patch.
 
-An edge has the energy of its candidate edges likewise; its links are shared vertices. Links join
-candidates alone. Links from the mesh would also subtract triangles that are no candidates, as in
-creases. The energy could then be negative.
+The energy of an edge and its candidate edges is analogous; its links are shared vertices. Links
+join candidates alone. Links of all triangles of the mesh would also subtract triangles that are no
+candidates, as in creases. The energy could then be negative.
 """
 
 from dataclasses import dataclass
@@ -44,13 +44,14 @@ from msmpetsc.contact.surface.near_parts import (
 if TYPE_CHECKING:
     import ipctk
 
-# Share of the sum of absolute weights at a place; a smaller sum is rounding.
+# Least sum of weights at a place over the sum of their absolute values [-]; a smaller
+# sum is rounding.
 ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
 class CandidateSet:
-    """Candidate pairs, with the numbers (2, k) of their parts, read at the first use."""
+    """Candidate pairs, and the numbers (2, k) of their parts, which are read at the first use."""
 
     candidates: "ipctk.Candidates"
 
@@ -59,12 +60,12 @@ class CandidateSet:
 
     @cached_property
     def faces(self) -> Indices:
-        """Numbers of triangles and vertices."""
+        """Numbers (2, k) of triangles and vertices."""
         return _numbers(self.candidates.fv_candidates, "face_id", "vertex_id")
 
     @cached_property
     def edges(self) -> Indices:
-        """Numbers of edges and edges."""
+        """Numbers (2, k) of first and second edges."""
         return _numbers(self.candidates.ee_candidates, "edge0_id", "edge1_id")
 
 
@@ -105,7 +106,7 @@ class Places:
         shared = np.unique(parts.shared[:count], return_inverse=True)[1]
         _keep_forest(order, pair, shared, weight)
         counted = np.flatnonzero(weight)
-        # A number begins with the kind, so the places are sorted by kind.
+        # The kind leads a place's number, so places are sorted by kind.
         places, of = np.unique(parts.place[counted], return_inverse=True)
         weight = weight[counted]
         sums, sizes = (np.bincount(of, some, len(places)) for some in (weight, np.abs(weight)))
@@ -119,7 +120,7 @@ class Places:
         return collisions
 
     def _collision(self, place: int, weight: float) -> "ipctk.NormalCollision":
-        """Return a place by its number, in ipctk's form."""
+        """Return the place of a number in ipctk's form."""
         import ipctk
 
         kind, first, second, case = map(int, np.unravel_index(place, self._shape))
@@ -140,7 +141,7 @@ class Places:
 def without_fading_links(pairs: "ipctk.NormalCollisions") -> "ipctk.NormalCollisions":
     """Return the pairs without links of nearly parallel edges.
 
-    ipctk does not project the Hessians of such links. The projections of other links are nearly 0.
+    ipctk does not project the Hessians of these links. The projections of other links are nearly 0.
     """
     kept = type(pairs)()
     kept.vv_collisions, kept.ev_collisions = pairs.vv_collisions, pairs.ev_collisions
@@ -155,7 +156,7 @@ def _keep_forest(order: Indices, pair: Indices, shared: Indices, weight: Floats)
 
     This is Kruskal's algorithm. Weights of nearest places stay.
 
-    order  : parts that may be links, the greatest b first; a link of two parts has the lesser b
+    order  : parts that may be links, the greatest b first; a link has the lesser b of its two parts
     shared : numbers from 0 on
     """
     parent, last = np.arange(len(pair)), np.full(len(pair), -1)

@@ -1,6 +1,6 @@
-"""Points of the surfaces that meet: first S = W q of the bodies, then of obstacles.
+"""Points of surfaces in contact: the points S = W q of bodies, then the points of obstacles.
 
-Each rank has the columns of W of its nodes. S is the sum of the ranks' contributions on rank 0,
+Each rank has the columns of W for its nodes. S is the sum of the ranks' contributions on rank 0,
 which has the surface mesh. A force f on the points is W^T f on each rank's nodes.
 """
 
@@ -15,14 +15,15 @@ from msmpetsc.lattice.lattice import Lattice
 
 
 class SurfacePoints:
-    """Matrix W by columns. All methods but ``carried`` are collective.
+    """Matrix W, stored by columns. All methods but ``carried`` are collective.
 
     bodies  : number of points of bodies
     total   : number of points, obstacles included
-    spread  : greatest sum of a point's absolute weights, a bound of its displacement over a node's
+    spread  : greatest sum of a point's absolute weights; no point moves more than ``spread`` times
+              as far as a node
     rows    : (k,) points that nodes of this rank carry, ascending
-    weights : (k, owned) of these points
-    sums    : (total, s) adds the contributions of all ranks, in their order, on rank 0
+    weights : (k, owned) weights of the nodes in these points
+    sums    : (total, s) matrix that adds the contributions of all ranks, in their order, on rank 0
     """
 
     def __init__(
@@ -55,7 +56,7 @@ class SurfacePoints:
         return points
 
     def moved(self, v: Rows) -> Rows:
-        """Return W v (total, 3) of v (owned or more, 3) on rank 0, (0, 3) elsewhere.
+        """Return W v (total, 3) for v (owned or more, 3) on rank 0; (0, 3) elsewhere.
 
         Rows of obstacles are 0.
         """
@@ -63,10 +64,10 @@ class SurfacePoints:
         return points
 
     def distances(self, q: Positions, time: float) -> Rows:
-        """Return the least distance (owned, k) [m] from each obstacle of the points of each node.
+        """Return the least distance (owned, k) [m] of each node's points from each obstacle.
 
-        A node without points has its own distance. The points of other nodes count, since a light
-        node may swing far out of its surface.
+        A node's points count, not the node itself, since a light node may swing far out of the
+        surface. A node without points has its own distance.
         """
         points = self(q, time)[: self.bodies]
         of_points = self.comm.bcast(self.obstacles.distances(points, time) if len(points) else None)

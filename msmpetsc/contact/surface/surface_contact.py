@@ -1,7 +1,7 @@
 """Contact of surfaces as a term of the energy that a step minimises: barrier and friction.
 
-Rank 0 computes all that concerns points. The other ranks send contributions of their nodes to
-S = W q, and receive the nonzero rows of forces. The Hessian is never formed on nodes:
+Rank 0 does all computations on points. The other ranks send contributions of their nodes to
+S = W q, and receive the nonzero rows of forces. The Hessian is never formed on nodes: the product
 W^T (H_c (W v)) over the points in contact takes a hundredth of the time.
 """
 
@@ -17,8 +17,8 @@ from msmpetsc.contact.surface.pairs import ContactSearch, SurfaceContactsAt
 from msmpetsc.contact.surface.surface_friction import SurfaceFriction
 
 TINY = np.finfo(float).tiny
-# Displacement, over dhat, below which the change of energy is mean force times
-# displacement
+# Displacement below which a change of energy is the mean force times the displacement
+# [dhat]; a difference of energies would lose its digits
 SMALL = 1e-4
 
 
@@ -36,7 +36,7 @@ class SurfaceHessian:
 
     @cached_property
     def _carrying(self) -> tuple[Indices, csr_array, csr_array]:
-        """This rank's nodes (c,) that carry points, their weights (k, c) and the transpose."""
+        """This rank's nodes (c,) that carry points, their weights (k, c), and the transpose."""
         nodes = np.unique(self.weights.indices)
         weights = csr_array(self.weights[:, nodes])
         return nodes, weights, csr_array(weights.T)
@@ -54,8 +54,9 @@ class SurfaceHessian:
     ) -> "tuple[SurfaceHessian | None, SurfaceHessian | None]":
         """Return the Hessians of stiff points and of the remaining points; None for no points.
 
-        compliance : (n,) of this rank's nodes [m/N]; a point stiffer than its nodes is stiff
-        most       : most stiff points, the stiffest of them
+        compliance : (owned,) compliance of this rank's nodes [m/N]; a point stiffer than its nodes
+                     is stiff
+        most       : greatest number of stiff points; the stiffest points come first
         """
         # ``power`` sorts its matrix in place
         given = self.comm.allreduce(self.weights.copy().power(2) @ compliance)
@@ -77,7 +78,7 @@ class SurfaceHessian:
         """Diagonal blocks (owned, 9) [N/m]."""
         nodes, weights, _ = self._carrying
         points, blocks = self.points.tobsr((3, 3)), np.zeros((self.weights.shape[1], 9))
-        # First point of each block; then w w' of all nodes that carry both points
+        # First point of each block; then w w' for all nodes that carry both points
         first = np.repeat(np.arange(len(points.indptr) - 1), np.diff(points.indptr))
         both = weights[first].multiply(weights[points.indices])
         blocks[nodes] = both.T @ points.data.reshape(-1, 9)
@@ -92,11 +93,11 @@ class SurfaceContact:
     start        : positions at the start of the step
     last         : positions one step before ``start``, for BDF2, whose slip is the end velocity
                    times tau
-    end          : end of an earlier solve of the step, whose normal forces set friction; None for
-                   the normal forces at the start
+    end          : end positions of an earlier solve of the step, which give the normal forces of
+                   friction; None for the normal forces at the start
     before       : contact in the last step
     has_friction : whether there is friction
-    friction     : of the step, on rank 0
+    friction     : friction in the step, on rank 0
     """
 
     def __init__(
@@ -132,11 +133,11 @@ class SurfaceContact:
         time_step: float,
         extrapolates: bool,
     ) -> SurfaceFriction | None:
-        """Return friction with the normal forces of a moment, on rank 0.
+        """Return friction with the normal forces of the contacts ``moment``, on rank 0.
 
-        points       : (p, 3) at the start of the step [m]
+        points       : (p, 3) points at the start of the step [m]
         came         : (p, 3) displacements in the last step [m], for BDF2; None otherwise
-        extrapolates : extrapolate the normal forces, in a step of BDF2
+        extrapolates : whether BDF2 extrapolates the normal forces
         """
         contacts, barrier, stick = (
             self.contacts,
@@ -160,7 +161,7 @@ class SurfaceContact:
         return replace(friction, limit=np.clip(2 * friction.limit - before, 0, 2 * friction.limit))
 
     def friction_limits(self, q: Positions) -> Floats:
-        """Return the sum of mu N [N] that friction uses, and the sum at q, (2,), on rank 0."""
+        """Return the sums of mu N [N], (2,), as friction uses it and at q; 0 on ranks above 0."""
         moment, barrier = self.contacts.find(q), self.contacts.barrier
         if self.contacts.law.friction == 0 or not barrier:
             return np.zeros(2)
@@ -179,8 +180,8 @@ class SurfaceContact:
     def change(self, q: Positions, base: Positions) -> float:
         """Return this rank's part of the energy at q minus that at base, with friction [J].
 
-        Over a small displacement it is the displacement times the mean force, since a difference
-        of energies would lose its digits.
+        Over a small displacement the change is the displacement times the mean force, since a
+        difference of energies would lose its digits.
         """
         before, after = self._acting(base), self._acting(q)
         if after is None and before is None:
@@ -223,7 +224,7 @@ class SurfaceContact:
     def add_change_of_gradient(self, q: Positions, displacements: Rows, gradient: Rows) -> None:
         """Add the first-order change of the gradient [N] at q as obstacles move.
 
-        The Hessian is projected pair by pair.
+        The change is a product with the projected Hessian.
 
         displacements : (o, 3) of the obstacles' points [m]
         """
@@ -255,7 +256,7 @@ class SurfaceContact:
     def of_obstacles(self, q: Positions, frame: Floats | float = 0.0) -> tuple[Rows, float]:
         """Return obstacles' forces (k, 3) [N] on the bodies, and their work [J] in the step to q.
 
-        The force at the end of the step does the work, an upper bound for a convex energy.
+        The work is of the force at the end of the step: an upper bound for a convex energy.
 
         frame : (3,) displacement of the frame [m] in which the work is counted
         """
@@ -273,7 +274,8 @@ class SurfaceContact:
     def pressing_displacement(self, before: Positions, after: Positions) -> tuple[float, Floats]:
         """Return the sum of forces [N], and the sum (3,) [N m] of force times displacement.
 
-        The sums are over obstacles' points on rank 0, at a step's start and end, without friction.
+        Both sums run over obstacles' points, at a step's start and at its end, without friction.
+        They are zero on ranks above 0.
         """
         contacts, total, weighted = self.contacts, 0.0, np.zeros(3)
         if contacts.obstacles.total:
@@ -296,7 +298,7 @@ class SurfaceContact:
     def duals_after(self, q: Positions, base: Positions, duals: Rows | None) -> Rows | None:
         """Return friction's duals (a, 3) after the full step from base to q.
 
-        None for its own forces.
+        duals : (a, 3) at base; None for the forces of the slips
         """
         after, before = self._acting(q), self._acting(base)
         if self.friction and after and before:
@@ -307,9 +309,10 @@ class SurfaceContact:
     def hessian(
         self, q: Positions, projected: bool, duals: Rows | None = None
     ) -> SurfaceHessian | None:
-        """Return the Hessian at q, projected pair by pair or not; None if nothing acts.
+        """Return the Hessian at q; None if no contact acts.
 
-        duals : (a, 3) of friction; None for its true Hessian
+        projected : project the Hessian of each pair to be positive semidefinite
+        duals     : (a, 3) duals of friction; None for the true Hessian of friction
         """
         moment = self._acting(q)
         if moment is None:
@@ -341,9 +344,9 @@ class SurfaceContact:
         return bound
 
     def _negative_part(self, moment: SurfaceContactsAt) -> tuple[Indices, Floats] | None:
-        """Return points (k,) with a negative part of the Hessian and its row sums (k,) [N/m].
+        """Return points (k,) at which the Hessian has a negative part, and its row sums (k,) [N/m].
 
-        Return None on ranks but 0.
+        On ranks above 0, return None.
         """
         whole, kept = (self._whole_hessian(moment, projected, None) for projected in (False, True))
         if whole is None or kept is None:
@@ -378,9 +381,9 @@ class SurfaceContact:
         return csr_array(sum(parts)) if parts else csr_array((moment.points.size,) * 2)
 
     def bound(self, q: Positions) -> Floats:
-        """Return bounds (owned,) [N/m] of the blocks of the projected Hessian.
+        """Return bounds (owned,) [N/m] of the diagonal blocks of the projected Hessian.
 
-        They are powers of 4, which seldom change.
+        The bounds are rounded up to powers of 4, so that they seldom change.
         """
         hessian = self.hessian(q, True)
         if hessian is None:

@@ -1,4 +1,4 @@
-"""Friction between parts of surfaces in one step, by the law of contact.friction.
+"""Friction between parts of surfaces in one step, with the law of contact.friction.
 
 The contact points, normal and normal force of a pair are fixed in a solve (Li et al. 2020,
 Incremental Potential Contact, section 5.3). So the slip of a pair is linear in the points.
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 class FrictionPairs:
     """Pairs of parts that press on each other.
 
-    numbers : (a, 4) points of each pair, -1 for none, of its first part, then of its second
-    weights : (a, 4) of these points in the vector from the second part to the first
+    numbers : (a, 4) points of each pair: of its first part, then of its second; -1 for none
+    weights : (a, 4) weights of these points in the vector from the second part to the first
     push    : (a,) normal force N [N]
     """
 
@@ -32,7 +32,7 @@ class FrictionPairs:
     push: Floats
 
     def slips(self, points: Positions) -> bsr_array:
-        """Return the matrix (3a, 3p) from displacements to tangential slips at points (p, 3)."""
+        """Return the matrix (3a, 3p) from displacements to slips, for normals at points (p, 3)."""
         gap = np.einsum("ai,aic->ac", self.weights, points[self.numbers])
         normal = gap / np.linalg.norm(gap, axis=1)[:, None]
         plane = np.eye(3) - squares(normal)
@@ -49,7 +49,7 @@ class SurfaceFriction(Friction):
 
     start : (p, 3) positions of points without slip [m]
     pairs : (a, 4) points of each pair, -1 for none (``FrictionPairs``)
-    slips : (3a, 3p) from displacements of all points to the slips of pairs
+    slips : (3a, 3p) matrix that maps displacements of all points to slips of pairs
     """
 
     start: Positions
@@ -73,7 +73,11 @@ class SurfaceFriction(Friction):
         )
 
     def values_of(self, pairs: Indices, values: Rows) -> Rows:
-        """Return (a, ...) the values (k, ...) of ``pairs`` (k, 4) that are pairs here, else 0."""
+        """Return values (a, ...) for this friction's pairs; 0 for pairs that are not in ``pairs``.
+
+        pairs  : (k, 4) points of known pairs
+        values : (k, ...) their values
+        """
         known = dict(zip(map(tuple, pairs.tolist()), values, strict=True))
         nothing = np.zeros(values.shape[1:])
         return np.array([known.get(tuple(pair), nothing) for pair in self.pairs.tolist()])
@@ -84,7 +88,10 @@ class SurfaceFriction(Friction):
         return gradient
 
     def hessian(self, points: Positions, duals: Rows | None = None) -> csr_array:
-        """Return the Hessian (3p, 3p) [N/m] at points (p, 3), with ``curvature`` of duals."""
+        """Return the Hessian (3p, 3p) [N/m] at points (p, 3) [m].
+
+        duals : (a, 3) duals of friction; None for the true Hessian
+        """
         blocks = self.curvature(points, np.eye(3)[None], duals)
         middle = bsr_array((blocks, np.arange(len(blocks)), np.arange(len(blocks) + 1)))
         return csr_array(self.slips.T @ (middle @ self.slips))
@@ -93,7 +100,7 @@ class SurfaceFriction(Friction):
 def friction_pairs(
     collisions: "list[ipctk.TangentialCollisions]", mesh: "ipctk.CollisionMesh"
 ) -> FrictionPairs:
-    """Return the pushing pairs of some sets, their pushes reduced by links of negative weight.
+    """Return the pairs that push in several sets. Links of negative weight reduce their pushes.
 
     Two vertices, or two edges, are ordered by their first points, since ipctk's order varies.
     """
@@ -135,9 +142,10 @@ def friction_pairs(
 
 
 def _less_links(numbers: Indices, push: Floats, points: int) -> Floats:
-    """Return pushes (a,) [N] whose positive part has, in each patch, the sum of all pushes.
+    """Return pushes (a,) [N], scaled so that their positive part keeps the sum of each patch.
 
-    numbers : (a, 4) points of each pair, -1 for none; pairs that share points are a patch
+    numbers : (a, 4) points of each pair, -1 for none; pairs that share points form a patch
+    push    : (a,) normal forces [N], negative for links
     """
     pair, corner = np.nonzero(numbers >= 0)
     touching = csr_array(

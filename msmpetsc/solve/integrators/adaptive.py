@@ -1,4 +1,4 @@
-"""Adaptive time steps: choose step lengths, powers of two apart, for a trajectory error.
+"""Adaptive time steps: choose step lengths, powers of two apart, for a given trajectory error.
 
 The local error of a step follows from positions q and velocities v at its ends:
 
@@ -6,8 +6,8 @@ The local error of a step follows from positions q and velocities v at its ends:
     BDF2            8/5 (q_(n+1) - q_n - t/2 (v_n + v_(n+1)))      = 2/9 t^3 da/dt + O(t^4)
 
 A BDF2 step without history has a further error (solve.integrators.implicit.Bdf2).
-``StepControl`` sums the root mean squares of local errors. It also counts impacts and changes of
-the force of penalties (scripts/docs/pages/time-steps.md).
+``StepControl`` sums the root mean squares of local errors. It also counts errors from impacts and
+from changes of penalty forces (scripts/docs/pages/time-steps.md).
 
 If U is the size of the motion, the trajectory error of the run may reach ``error`` U. Each step
 spends its local error from a credit that grows with the motion and with time:
@@ -42,15 +42,16 @@ from msmpetsc.solve.work import Work
 LOWEST, HIGHEST = -10, 6
 # number of step lengths whose integrators are kept; neighbouring lengths alternate
 KEPT = 4
-# end of a step before an event, over the event's time; the event must not act yet
+# end of a step before an event [time of the event]; the event must not act yet
 JUST_BEFORE = 1 - 0.5 * AT_EVENT
-# part of the saved credit that a step may spend; savings must last for an impact
+# part of the saved credit that a step may spend [-]; savings must last for an impact
 SAVINGS_SHARE = 1 / 8
-# part of an equal share of all credit that any step may spend; the run must advance
+# part of an equal share of all credit that any step may spend [-]; the run must advance
 FAIR_SHARE = 0.25
-# largest accepted error, over the allowed error; an excess shortens the next step
+# largest accepted error [allowed error]; an excess shortens the next step
 EXCESS = 2.0
-# steps in a row that allow a longer step before the step grows; it must not alternate
+# number of steps in a row that allow a longer step before the step grows [-]; step
+# lengths must not alternate
 CALM = 2
 
 
@@ -73,7 +74,7 @@ def local_error(order: int, q: Positions, v: Rows, x: Positions, w: Rows, time_s
 def between(
     q_0: Positions, v_0: Rows, q_1: Positions, v_1: Rows, time_step: float, s: float
 ) -> tuple[Positions, Rows]:
-    """Return positions and velocities within a step by Hermite's cubic between its ends.
+    """Return positions and velocities within a step, by Hermite's cubic between the step's ends.
 
     s : position within the step, 0 at its start and 1 at its end; other values extrapolate
     """
@@ -93,7 +94,7 @@ class Measure:
 
 
 class StepControl:
-    """Choose the levels of steps and keep the error account of a run, equally on all ranks.
+    """Choose the levels of steps and keep the error account of a run, alike on all ranks.
 
     A step of a level is 2^level times as long as the scene's step.
 
@@ -147,7 +148,7 @@ class StepControl:
         return level > self.lowest
 
     def pay(self, level: int, measure: Measure) -> None:
-        """Enter an accepted step into the account, and choose the level of the next step."""
+        """Enter an accepted step into the error account, and choose the level of the next step."""
         allowed = self.allowed(level, measure)
         longer = self.level + 1
         growth = 2.0 ** ((self.order + 1) * (longer - level))
@@ -211,11 +212,11 @@ class Adaptive(Integrator):
     """Take the scene's steps as adaptive steps, which may be shorter or longer.
 
     A state has the velocity (q_n - q_(n-1)) / t with the scene's step t. If the last step was
-    longer than the scene's, the state's time lies beyond the frame. Its history is the start of
-    the last step.
+    longer than the scene's step, the state's time may lie beyond the frame. The history of a state
+    is the start of the last step.
 
     integrators : level -> integrator; the integrator used last comes last
-    tick        : time of the state (Ticks)
+    tick        : time of the state in ticks (Ticks)
     last        : level of the last step
     """
 
@@ -252,13 +253,13 @@ class Adaptive(Integrator):
         )
 
     def _integrator(self, level: int) -> Integrator:
-        """Return the integrator of a level, without data of steps before another level's."""
+        """Return the integrator of a level; if the level is new, drop data of earlier steps."""
         if level not in self.integrators:
             time = self.time.model_copy(update={"step": self._length(level), "error": None})
             self.integrators[level] = self.make(time, self.solver)
             self.integrators[level].set_up()
             if self.tick:
-                # A new integrator must not differ from a kept integrator.
+                # A new integrator must behave like a kept integrator.
                 self.integrators[level].forget()
         elif level != next(reversed(self.integrators)):
             self.integrators[level] = self.integrators.pop(level)
@@ -289,9 +290,11 @@ class Adaptive(Integrator):
         return replace(total, time_error=self.control.estimate), state
 
     def _within(self, total: StepResult, state: State, remaining: float, time: float) -> StepResult:
-        """Return the result at ``time``, the ``remaining`` part of the last step before its end.
+        """Return the result at ``time`` [s], within the last step.
 
-        Before its end there are no forces of the step: inertia, friction and viscosity.
+        Before the end of the step, the result has no inertia, friction and viscosity.
+
+        remaining : part of the last step from ``time`` to the step's end, from 0 to 1
         """
         q, v = state.q, state.velocity(self.time_step)
         if remaining > 0:
@@ -333,8 +336,8 @@ class Adaptive(Integrator):
     def _start_of(self, state: State, level: int, restarts: bool) -> State:
         """Return the state from which a step of a level starts; ``restarts`` drops the history.
 
-        The history of another level has the mean acceleration a of the last step. So loads change
-        its velocity in proportion to their impulse in that step (Bdf2).
+        If the last step had another level, its mean acceleration a gives the history. Then loads
+        have changed the velocity in proportion to their impulse in the last step (Bdf2).
         """
         q, v, t, span = state.q, state.velocity(self.time_step), self._length(level), None
         history = None if restarts or self.order < 2 else state.history
@@ -345,11 +348,11 @@ class Adaptive(Integrator):
         return replace(state, q_previous=q - t * v, history=history, span=span)
 
     def _end_time(self, tick: int) -> float:
-        """Return the end time [s] of a step that ends at a tick: just before an event there."""
+        """Return the end time [s] of a step that ends at a tick; just before it for an event."""
         return self.ticks.time(tick) * (JUST_BEFORE if tick in self.ticks.events else 1.0)
 
     def _measure(self, before: State, result: StepResult, after: State, level: int) -> Measure:
-        """Return the local error of a step and the size of the motion."""
+        """Return the local error of a step and the size of the motion up to its end."""
         owned, t = slice(self.lattice.owned), self._length(level)
         mass, q, v = self.lattice.mass, before.q[owned], before.velocity(t)[owned]
         x, w = result.position[owned], (result.position - result.previous)[owned] / t
@@ -383,7 +386,7 @@ class Adaptive(Integrator):
     def _accepted(
         self, result: StepResult, before: State, after: State, level: int
     ) -> tuple[StepResult, State]:
-        """Return the result and the state after an accepted step, for the scene's step."""
+        """Return result and state after an accepted step, with q_(n-1) for the scene's step."""
         t, T = self._length(level), self.time_step
         self.tick += self.ticks.length(level)
         self.last = level

@@ -1,13 +1,13 @@
 """Implicit integrators: implicit Euler and BDF2 take each step as a minimisation.
 
 Both integrators solve  M (x - y) + tau^2 (grad E(x) - f_ext) = 0  for x. They differ in y, the
-positions without forces, and in tau, which is a fixed part of the time step t. In f_ext, loads have
+positions without forces, and in tau, which is a fixed part of the time step t. In f_ext, loads are
 means over steps, so that their impulse on a free body is their integral over time.
 
 The velocity at the end is v = (x - c) / tau, and y = c + tau w. Mass-proportional damping changes y
 and tau (solve.integrators.mass_damping). For a viscous solid, E contains the dissipation over the
-step (elasticity.viscosity), with x^ = c. The rates of implicit Euler belong to the mid-step
-rotation, and the rates of BDF2 to the step's end.
+step (elasticity.viscosity), with x^ = c. The cells' rotation in the viscosity is predicted for the
+middle of the step by implicit Euler, and for its end by BDF2.
 """
 
 from collections.abc import Callable
@@ -34,11 +34,11 @@ from msmpetsc.solve.petsc.events import CONTACT
 from msmpetsc.solve.presets import find_preset
 from msmpetsc.solve.work import Work
 
-# most solves of a step until its contact faces are right; wrong faces let nodes pass
-# through a thin obstacle
+# greatest number of solves until a step's contact faces are right; wrong faces let
+# nodes pass through a thin obstacle
 MOST_SOLVES = 10
-# energy of surface pairs that may be left out, over the energy tolerance of the step; x
-# then moves by 0.01 of the error
+# energy of surface pairs that may be left out [energy tolerance of the step]; leaving
+# them out moves x by 0.01 of the error
 LEFT_OUT = 1e-4
 
 
@@ -47,24 +47,24 @@ class ContactFaces:
     """Find the obstacle faces at which nodes are in contact in a step. All methods are collective.
 
     The first solve takes the faces that nodes cross on the path from q to y. If the path to the
-    solution x crosses other faces that push otherwise, the step is solved again. From then on a
-    node keeps its face, so that the search ends.
+    solution x crosses faces that give other forces, the step is solved again. From then on a node
+    keeps its face, so that the search ends.
 
     If the surface has few contacts at the start, the first solves use only candidate pairs around
-    these contacts. Without contacts they use no pairs. If the solution shows other contacts, the
-    step is solved again. This replaces a broad phase at each iterate.
+    these contacts, and no pairs without contacts. If the solution shows other contacts, the step is
+    solved again. So no iterate needs a broad phase.
 
     q, y       : as in StepProblem
     load       : external forces
-    before     : (o, l) faces at the start of the step; None: the nearest faces
+    before     : (o, l) faces at the start of the step; None for the nearest faces
     fixed      : (l,) bool, nodes that are not unknowns
     q_before   : (l, 3) [m] positions one step before q, for BDF2
     sides      : (o, l) faces of the next solve; in the end, the faces of the step
     is_settled : whether the last solve had the right contacts
     contact    : contact of the last solve
-    start      : (l, 3) [m] solution that the next solve may start from
-    end        : (l, 3) [m] earlier solution, whose normal forces set friction; None for the forces
-                 at q
+    start      : (l, 3) [m] solution from which the next solve may start
+    end        : (l, 3) [m] earlier solution, whose normal forces limit friction; None for the
+                 forces at q
     """
 
     environment: Environment
@@ -118,7 +118,7 @@ class ContactFaces:
 
         Raises StepFailed if the faces do not settle in MOST_SOLVES solves.
 
-        left_out : [J] energy of surface pairs at x that may be left out
+        left_out : energy of surface pairs at x that may be left out [J]
         """
         crossed, pressing = self._crossed(x), self.environment.obstacles.pressing
         sides = np.where(self.sides > 0, self.sides, crossed) if self.solves else crossed
@@ -164,8 +164,8 @@ class ImplicitEuler(Integrator):
 
         v_(n+1) = v_n + t M^(-1) (f_ext - grad E(q_(n+1))),    q_(n+1) = q_n + t v_(n+1),
 
-    with y = q_n + t v_n = 2 q_n - q_(n-1) and tau = t (Eq. 10-12). If an anchor ends, a new solver
-    is made, because its nodes become unknowns.
+    with y = q_n + t v_n = 2 q_n - q_(n-1) and tau = t (Eq. 10-12). If an anchor ends, its nodes
+    become unknowns, so a new solver is made.
 
     TAU_PER_STEP : tau / t
     STATIC       : whether F has no inertia
@@ -197,7 +197,7 @@ class ImplicitEuler(Integrator):
     def _rates(
         self, q: Positions, y: Positions, q_before: Positions | None
     ) -> tuple[Positions, Positions] | None:
-        """Return x^ of a viscous solid and the positions whose rotation K has, (l, 3) [m] each.
+        """Return x^ of a viscous solid and the positions that rotate its K, (l, 3) [m] each.
 
         Return None if the solid is not viscous.
         """
@@ -240,9 +240,9 @@ class ImplicitEuler(Integrator):
     ) -> tuple[StepResult, Indices]:
         """Return the solution of the step to ``time`` [s] and its contact faces (o, l).
 
-        y        : (l, 3) [m] positions without forces
+        y        : (l, 3) positions without forces [m]
         load     : external forces
-        q_before : (l, 3) [m] positions one step before the state, for BDF2
+        q_before : (l, 3) positions one step before the state [m], for BDF2
         """
         fixed = self.stepper.lattice.pinned
         faces = ContactFaces(
@@ -261,7 +261,7 @@ class ImplicitEuler(Integrator):
         return self._with_viscosity(result), faces.sides
 
     def _with_viscosity(self, result: StepResult) -> StepResult:
-        """Return a step's result with the viscous forces and the fall of D (StepResult)."""
+        """Return a step's result with the viscous forces and the decrease of D (StepResult)."""
         viscosity, problem = self.stepper.functional.elasticity.viscosity, result.problem
         if viscosity is None or problem is None:
             return result
@@ -290,18 +290,18 @@ class ImplicitEuler(Integrator):
         )
 
     def _let_go(self, time: float) -> None:
-        """Make a new solver if an anchor has ended before ``time`` [s] (collective)."""
+        """Make a new solver if an anchor has ended by ``time`` [s] (collective)."""
         anchors = self.environment.anchors.acting(time)
         if len(anchors) < len(self.anchors):
             self.anchors = anchors
             self.destroy()
-            # A resumed run has not seen the tau before.
+            # Begin with the first tau, because a resumed run does not know the old tau.
             self.tau = self._first_tau()
             self.stepper = self._new_stepper(time)
             self.set_up()
 
     def save(self, checkpoint: Checkpoint) -> None:
-        # Before the first step there is nothing to forget.
+        # Before the first step the solver has nothing to forget.
         if checkpoint.step:
             self.stepper.forget(modes=False)
         checkpoint.keep_counts(self)
@@ -343,9 +343,9 @@ class Bdf2(ImplicitEuler):
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         """Take the step that ends at ``time`` [s] (collective). Raises StepFailed.
 
-        A node that rebounds keeps its position. Its new history leads to this position with the new
-        velocity and with the node's present acceleration. Without the acceleration, an impact would
-        add energy.
+        A node that rebounds keeps its position. Its new history leads to this position, with the
+        new velocity and with the node's present acceleration. Without this acceleration, an impact
+        would add energy.
         """
         self._let_go(time)
         q, v, work_before = state.q, state.velocity(self.time_step), Work()
@@ -385,10 +385,9 @@ class Bdf2(ImplicitEuler):
     ) -> tuple[tuple[Positions, Rows], Rows, float, Work]:
         """Return a history for a state without history, the velocities, the error, and the work.
 
-        Held components have the velocity of their path from now on, and no acceleration.
-
         The history leads to q and v with the acceleration a of an implicit Euler step of length
-        tau. The error of this acceleration is of first order.
+        tau. The error of this acceleration is of first order. Held components have the velocity of
+        their path, and no acceleration.
 
         A mode of frequency w has a = a_n / (1 + (tau w)^2), with the acceleration a_n at q. The
         BDF2 step then moves it as if its acceleration were constant. The error [m sqrt(kg)] is
@@ -404,7 +403,7 @@ class Bdf2(ImplicitEuler):
         return history, v, self._begun_error(result), result.cost
 
     def _begun_error(self, result: StepResult) -> float:
-        """Return the error [m sqrt(kg)] of the history that ``_history`` makes of this result."""
+        """Return the error [m sqrt(kg)] of the history that ``_history`` makes from a result."""
         functional, problem = self.stepper.functional, result.problem
         assert problem is not None
         moved = functional.vectors.take()

@@ -19,9 +19,9 @@ class EnergyBudget:
     """Account of a run's energies [J], as solve.energy_balance defines them.
 
     put_in      : largest legitimate energy of the body so far
-    gained      : spurious energy that was not dissipated since; negative as a credit
-    steady      : spurious energy without the known oscillation
-    since_frame : spurious energy gained since the frame stored before
+    gained      : spurious energy that is not yet dissipated; negative for a credit
+    steady      : ``gained`` without the known oscillation
+    since_frame : spurious energy gained since the last stored frame
     bounced     : energy that nodes gained by rebounding after the last solve
     """
 
@@ -44,9 +44,9 @@ class State:
     The velocity is (q_n - q_(n-1)) / t. If nodes rebound after the solve, the state differs from
     the frame, which shows the solution.
 
-    history : q and velocity [m/s] one step earlier, for multistep methods; None: no history
-    span    : length [s] of the last step if the history belongs to another length; None: the same
-    sides   : (o, l) obstacle faces at which the nodes are in contact; None: the nearest faces
+    history : q [m] and velocity [m/s] one step earlier, for multistep methods; None without history
+    span    : length [s] of the last step; None if it equals the step length of the history
+    sides   : (o, l) obstacle faces at which the nodes are in contact; None for the nearest faces
     budget  : energy budget after the steps so far
     """
 
@@ -71,7 +71,7 @@ class State:
         """Store the state in a checkpoint.
 
         uses_history : whether the integrator reads the history
-        has_sides  : whether contact reads the sides
+        has_sides    : whether contact reads the sides
         """
         rows = {"q": self.q[:owned], "q_previous": self.q_previous[:owned]}
         if uses_history:
@@ -104,7 +104,7 @@ class State:
 class Integrator(Protocol):
     """Method that takes steps of a fixed length. All methods are collective.
 
-    time_step  : [s]
+    time_step    : length of a step [s]
     uses_history : whether the method reads State.history
     """
 
@@ -112,7 +112,7 @@ class Integrator(Protocol):
     uses_history: bool = False
 
     def set_up(self) -> None:
-        """Prepare the first step. Raises InputError for options that cannot be used."""
+        """Prepare the first step. Raises InputError for options that PETSc cannot apply."""
         return
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
@@ -128,7 +128,7 @@ class Integrator(Protocol):
         """Resume after the step that ended at ``time`` [s]."""
 
     def forget(self) -> None:
-        """Drop all data of earlier steps, so that the next step does not depend on it."""
+        """Drop all data of earlier steps, so that the next step depends on the state alone."""
 
     def destroy(self) -> None:
         """Destroy all PETSc objects."""

@@ -1,17 +1,17 @@
 """Statics: each step of the scene is an equilibrium under the loads at its end, without inertia.
 
 An equilibrium minimises E(x) - x^T f_ext plus the contact energy. This is the problem of an
-implicit step without M, so that the same solver applies, with the residual
+implicit step without M, so the same solver applies, with the residual
 
     F(x) = tau^2 (grad E(x) - f_ext).
 
-M is used only to weight errors. tau scales F so that M^(-1) tau^2 (Hessian of E) of the body at
-rest has no eigenvalue far below 1. Error bounds of implicit steps rely on the same property.
+M only weights errors. tau scales F so that M^(-1) tau^2 (Hessian of E) of the body at rest has no
+eigenvalue far below 1. Error bounds of implicit steps rely on the same property.
 
-If the whole load fails or turns cells inside out, which springs cannot turn back, it is applied in
-load steps. The load of share s, from 0 to 1, is f_ext + (1 - s) r. The holding force
-r = grad E(x_0) - f_ext keeps the last state, x_0, in place. A start that the scene gives is no
-equilibrium. If the whole load fails from this start or leaves folds, x_0 is the rest shape.
+If the solve with the whole load fails or turns cells inside out, which springs cannot turn back,
+the load is applied in load steps. The load of share s, from 0 to 1, is f_ext + (1 - s) r. The
+holding force r = grad E(x_0) - f_ext keeps the last state, x_0, in place. A start that the scene
+gives is no equilibrium. If a solve from this start fails or leaves folds, x_0 is the rest shape.
 """
 
 from dataclasses import dataclass, replace
@@ -38,13 +38,14 @@ from msmpetsc.solve.petsc.library import petsc_errors
 from msmpetsc.solve.recovery import Halving
 from msmpetsc.solve.work import Work
 
-# first tau, over the time that sound takes along the body; slender bodies are slower
+# first tau [travel time of sound along the body]; slender bodies oscillate more slowly
 SLENDER = 10.0
-# lowest eigenvalue of M^(-1) tau^2 (Hessian of E) that tau aims at; 1 with a margin
+# lowest eigenvalue of M^(-1) tau^2 (Hessian of E) that a new tau aims at [-]; 1 with a
+# margin
 LOWEST = 10.0
-# lowest eigenvalues between which tau stays; another tau needs a new solver
+# range of the lowest eigenvalue in which tau stays [-]; another tau needs a new solver
 ACCEPTED_LOWEST = 1.0, 1e3
-# halvings of a load step beyond which smaller steps hardly help
+# number of halvings of a load step beyond which smaller steps hardly help
 SMALL = 4
 
 
@@ -52,11 +53,12 @@ SMALL = 4
 class LoadPath:
     """Equilibria on the path from a state to the next state. All methods are collective.
 
-    base      : (l, 3) [m] positions of the state before
-    target    : (l, 3) [m] prescribed positions at the whole load; None without anchors
+    base      : (l, 3) positions x_0 of the last state [m]
+    target    : (l, 3) prescribed positions at the whole load [m]; None without anchors
     known     : shares and positions (l, 3) [m] of the last two equilibria
     sides     : (o, l) contact faces of the last share
-    displaced : whether the state before is an initial state other than the rest shape
+    displaced : whether the last state is an initial state other than the rest shape
+    inverted  : number of inverted cells in the last state; 0 for an initial state
     holding   : holding force r (owned, 3) [N]; None until a share needs the force
     """
 
@@ -79,9 +81,9 @@ class LoadPath:
         self.problem: StepProblem | None = None
 
     def try_share(self, steps: Halving) -> StepResult:
-        """Return the equilibrium of the share to try.
+        """Return the equilibrium of the next share, ``steps.end``.
 
-        Raises StepFailed if there is none, or if smaller load steps may avoid its inverted cells.
+        Raises StepFailed if the solve fails, or if smaller load steps may avoid inverted cells.
         """
         share = steps.end
         q = self.known[-1][1]
@@ -127,7 +129,7 @@ class LoadPath:
         return replace(whole, y=self.base, load=load, prescribed=prescribed)
 
     def _guess(self, problem: StepProblem, share: float) -> Positions:
-        """Return the last equilibrium or an extrapolation (l, 3) [m], whichever has the lower g."""
+        """Return the last equilibrium or an extrapolation (l, 3) [m]: the one with the lower g."""
         (share_before, before), (reached, q) = self.known[0], self.known[-1]
         if reached == share_before:
             return q
@@ -143,7 +145,7 @@ class LoadPath:
 
 
 class Static(ImplicitEuler):
-    """Find the equilibrium at the end of each step, starting from the equilibrium before.
+    """Find the equilibrium at the end of each step, starting from the last equilibrium.
 
     Forces, anchors and obstacles are taken at the end of the step.
 
@@ -184,7 +186,7 @@ class Static(ImplicitEuler):
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         self._let_go(time)
         before = time - self.time_step
-        # Under the same loads the equilibrium is the state before.
+        # If nothing that acts has changed, the last state is the equilibrium.
         if before > 0.5 * self.time_step and self.environment.is_same(before, time):
             cost = Work(self.error, steps=1)
             return StepResult(state.q, state.q, cost, static=True, problem=self.problem), state
@@ -224,7 +226,7 @@ class Static(ImplicitEuler):
 
 
 def _rigid_rank(unknowns: Unknowns, fixed: Mask) -> int:
-    """Return how many rigid motions the few fixed components (owned, 3) prevent (collective)."""
+    """Return the number of rigid motions that fixed components (owned, 3) prevent (collective)."""
     lattice = unknowns.lattice
     node, component = np.nonzero(fixed)
     x = to_host(lattice.nodes)[node] / lattice.cell_size
@@ -243,9 +245,9 @@ def _stiffness(lattice: Lattice) -> float:
 
 
 def refuse_free_bodies(unknowns: Unknowns) -> None:
-    """Raise InputError if a body is free to move or too little of it is held (collective).
+    """Raise InputError if a body can move as a whole, freely or about a few points (collective).
 
-    A part that no spring joins with the rest counts as a body.
+    A part that no spring or cell joins with the rest counts as a body.
     """
     bodies, lattice = bodies_of(unknowns), unknowns.lattice
     support = "held at a point or two, about which it turns"

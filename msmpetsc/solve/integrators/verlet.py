@@ -8,10 +8,10 @@ Each substep kicks, drifts and kicks, with a = M^(-1) (f_ext - grad E), contact 
 
 Adjacent half kicks are merged, except at the ends of a step, so that a frame has q and v of the
 same time. A kick has the mean of f_ext over its duration. The method is stable if dt < 2 / omega,
-where omega^2 is the largest eigenvalue of M^(-1) (Hessian of E).
+with omega^2 the largest eigenvalue of M^(-1) (Hessian of E).
 
-This limit holds for small oscillations only (scripts/docs/pages/integrators.md). Beyond them, the
-substeps gain the error of the trapezoidal rule for the work of the springs,
+This limit holds for small oscillations only (scripts/docs/pages/integrators.md). In large
+oscillations the energy gains the error of the trapezoidal rule for the work of the springs,
 
     E(q_N) - E(q_0) - sum_n 1/2 (grad E(q_n) + grad E(q_(n+1))) . (q_(n+1) - q_n)
 
@@ -46,23 +46,24 @@ from msmpetsc.solve.linear.largest_eigenvalue import HighestMode
 from msmpetsc.solve.nonlinear.step import StepResult
 from msmpetsc.solve.work import Work
 
-# substep over the stability limit; the Hessian changes within a step
+# length of a substep [stability limit]; the Hessian changes within a step
 SAFETY = 0.8
-# most repetitions of a step; they bound the cost of an unstable step
+# greatest number of repetitions of a step; bounds the cost of an unstable step
 RETRIES = 4
-# spurious energy that halves the substep length, over all energy; a fifth of
+# spurious energy above which the substep length is halved [all energy]; a fifth of
 # NOTABLE_GAIN
 GAIN = 2e-3
-# gain below which the substep length doubles, over the limit; twice as long substeps
-# gain 4 to 16 times more
+# gain below which the substep length doubles [limit of the gain]; substeps twice as
+# long gain 4 to 16 times as much
 EASED = 1 / 32
-# most halvings of the substep length; 32 times as many substeps bound the cost
+# greatest number of halvings of the substep length; 32 times as many substeps bound the
+# cost
 HALVINGS = 5
-# most substeps of a step; more would take hours
+# greatest number of substeps in a step; more would take hours
 MOST_SUBSTEPS = 1e6
-# spurious energy that rounding may cause, over the least energy of an unstable body
+# spurious energy that rounding may cause [least energy of an unstable body]
 ROUNDING = 1e-14
-# elastic energy of an unstable body, over the energy of crushed springs; no load
+# least elastic energy of an unstable body [energy that crushes all springs]; no load
 # reaches it
 UNSTABLE = 100.0
 
@@ -70,14 +71,16 @@ UNSTABLE = 100.0
 class Verlet(Integrator):
     """Take steps by the velocity Verlet method; ``time.substep`` may only shorten its substeps.
 
+    gradient     : (l, 3) grad E [N], contact included
     elastic      : (owned, 3) grad E [N] without contact
-    contact      : contact at the present positions; None without any
-    work         : [J] of a step: work of obstacles, varying loads and anchors on this rank's nodes
-    springs_work : [J] of a step: work that the springs of this rank's nodes absorb
-    gained       : [J] spurious energy of the springs so far, less its dissipation; negative: credit
-    halvings     : halvings of the substep length because of spurious energy
+    contact      : contact at the present positions; None without contact
+    work         : work [J] of obstacles, loads and anchors on this rank's nodes in a step
+    springs_work : work [J] that the springs of this rank's nodes absorb in a step
+    gained       : spurious energy [J] of the springs so far, less its dissipation; negative for a
+                   credit
+    halvings     : number of halvings of the substep length because of spurious energy
     end          : end time of the step [s]
-    known        : positions (l, 3) [m] that ``gradient`` and the highest frequency belong to
+    known        : positions (l, 3) [m] of ``gradient`` and of the highest frequency
     """
 
     state: ClassVar[dict[str, Range]] = {
@@ -127,8 +130,8 @@ class Verlet(Integrator):
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         """Take the step that ends at ``time`` [s] (collective). Raises StepFailed.
 
-        If the end of the step shows that the substeps were too long, repeat it with shorter
-        substeps: an impact may stiffen the body, and folded cells may gain spurious energy.
+        If the end of the step shows that the substeps were too long, the step is repeated with
+        shorter substeps: an impact may stiffen the body, and folded cells may gain spurious energy.
         """
         start, self.end = time - self.time_step, time
         self.environment.forces.begin_step(state.q, state.velocity(self.time_step), start)
@@ -142,7 +145,7 @@ class Verlet(Integrator):
             dt = self.time_step / count
             self.load = self._mean_load(start, start + 0.5 * dt)
             squared_start = self._squared_acceleration()
-            # The energy below shows an overflow.
+            # An overflow shows in the energy below.
             with np.errstate(over="ignore", invalid="ignore"):
                 self._take_substeps(count, start, time)
             energy = reduced(self.comm, self.elasticity.energy(self.position.values))
@@ -203,7 +206,7 @@ class Verlet(Integrator):
     def _count_work(self, moved: Rows, fixed: Mask) -> None:
         """Add half the work [J] of the present forces to the work of springs, loads and anchors.
 
-        moved : (owned, 3) [m] displacements of the substep
+        moved : (owned, 3) displacements of the substep [m]
         fixed : (owned, 3) bool, components that anchors move against all forces
         """
         self.springs_work += 0.5 * np.vdot(self.elastic, moved)
@@ -211,14 +214,14 @@ class Verlet(Integrator):
         self.work += 0.5 * float(np.vdot(forces, moved))
 
     def _is_to_halve(self, start: Rows, energy: float) -> bool:
-        """Return whether a step gained too much energy, and then halve the substep length.
+        """Return whether a step gained too much energy; if so, halve the substep length.
 
-        If the gain is negligible, double the substep length of the next step. With penalty
-        obstacles there is no halving, because the springs may gain energy from the obstacles
+        If the gain is negligible, the substep length of the next step doubles. With penalty
+        obstacles the length is never halved, because the springs may gain energy from the obstacles
         (collective).
 
-        start  : (l, 3) [m] positions at the start of the step
-        energy : elastic energy [J] at its end
+        start  : (l, 3) positions at the start of the step [m]
+        energy : elastic energy at the end of the step [J]
         """
         own = self.elasticity.change(self.position.values, start) - float(self.springs_work)
         mass = self.lattice.mass[: self.lattice.owned, None]
@@ -248,7 +251,7 @@ class Verlet(Integrator):
     def _result(self, count: int, swing: float) -> tuple[StepResult, State]:
         """Return the result of a step of ``count`` substeps, and the state after it (collective).
 
-        swing : [J] known oscillation of this rank's energy over the step
+        swing : known oscillation of this rank's energy over the step [J]
         """
         self.velocity.update()
         self.known = self.position.values.copy()
@@ -271,7 +274,7 @@ class Verlet(Integrator):
     def _kick(self, time: float, duration: float, begin: float, end: float) -> None:
         """Change v by the forces at ``time`` over ``duration`` [s], with damping and friction.
 
-        begin, end : times [s] of the substep whose motion the obstacles have
+        begin, end : times [s] of the substep that gives the obstacles' velocities
         """
         kept = self.v[self.partly]
         self._damp(0.5 * duration)
@@ -295,7 +298,7 @@ class Verlet(Integrator):
             self.v[self.free] *= decay(duration, self.damping)
 
     def _drift(self, begin: float, end: float) -> None:
-        """Move q to the end of a substep: anchored nodes on their paths, impacts reflected."""
+        """Move q to the end of a substep: move anchored nodes on their paths, reflect impacts."""
         self._update_fixed(end)
         drift(len(self.free), self.q, end - begin, self._movers())
         prescribed = self.environment.anchors.prescribed(self.position.values, end)
@@ -334,7 +337,7 @@ class Verlet(Integrator):
             self.q[struck] = after[struck]
 
     def _update_fixed(self, time: float) -> None:
-        """Update the free nodes if an anchor begins or ends before ``time`` [s]."""
+        """Update the free nodes if the number of anchors that act has changed by ``time`` [s]."""
         anchors = len(self.environment.anchors.acting(time))
         if anchors != self.anchors:
             self.anchors = anchors
@@ -342,13 +345,13 @@ class Verlet(Integrator):
             self.highest.fix(self.fixed)
 
     def _fix(self, fixed: Mask) -> None:
-        """Set the fixed components (owned, 3), the nodes that move, and their fixed components."""
+        """Set the fixed components (owned, 3), the free nodes and their fixed components."""
         pinned = fixed.all(axis=1)
         self.fixed, self.free = fixed, np.flatnonzero(~pinned)
         self.partly = np.nonzero(fixed & ~pinned[:, None])
 
     def _contact_bound(self, start: float, time: float) -> float:
-        """Return Weyl's bound on the obstacles' part of omega^2 [1/s^2] (collective)."""
+        """Return a bound [1/s^2] on the obstacles' part of omega^2, by Weyl (collective)."""
         fall = self._mean_load(start, time) * self.per_mass[:, None] * self.time_step
         speed = greatest(np.linalg.norm(np.abs(self.v) + np.abs(fall), axis=1))
         speed = reduced(self.comm, speed, MPI.MAX)
@@ -368,7 +371,7 @@ class Verlet(Integrator):
                 self.substep,
                 limit,
             )
-            # The warning comes once.
+            # Warn only once.
             self.substep = np.inf
         count = self.time_step / min(limit, self.substep)
         if not count < MOST_SUBSTEPS:
@@ -385,7 +388,7 @@ class Verlet(Integrator):
 
 @kernel
 def kick(first: int, count: int, step: int, load: Rows, duration: float, nodes: Movers) -> None:
-    """Add duration M^(-1) (f_ext - grad E) to v."""
+    """Add M^(-1) (f_ext - grad E) times ``duration`` [s] to v."""
     for row in range(first, count, step):
         i = nodes.rows[row]
         for c in range(3):
@@ -394,7 +397,7 @@ def kick(first: int, count: int, step: int, load: Rows, duration: float, nodes: 
 
 @kernel
 def drift(first: int, count: int, step: int, q: Positions, duration: float, nodes: Movers) -> None:
-    """Add duration v to q."""
+    """Add v times ``duration`` [s] to q."""
     for row in range(first, count, step):
         i = nodes.rows[row]
         for c in range(3):

@@ -1,4 +1,4 @@
-"""The Hessian of a step as a PETSc matrix, for solvers that need one.
+"""The Hessian of a step as a PETSc matrix, for export and for solvers that need a matrix.
 
 A row of the matrix belongs to a coordinate of a free node: x, y and z of a node in sequence. Rows
 and columns of fixed components are zero except for their diagonals. Solvers of this package need no
@@ -24,7 +24,7 @@ from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo
 
 
 class HessianBlocks(NamedTuple):
-    """Blocks of this rank that add up to the Hessian over all ranks.
+    """Blocks of this rank; the Hessian is the sum of all ranks' blocks.
 
     first, second : (k,) global numbers of the nodes of rows and columns, -1 if pinned
     values        : (k, 3, 3) [kg]
@@ -52,7 +52,7 @@ def blocks_of(hessian: TrueHessian) -> HessianBlocks:
 
 
 def assembled(unknowns: Unknowns, blocks: HessianBlocks) -> PETSc.Mat:
-    """Return the Hessian as an AIJ of block size 3 in CPU memory (collective).
+    """Return the Hessian as an AIJ matrix of block size 3 in CPU memory (collective).
 
     Raises InputError if the nonzeros exceed PETSc's integers.
     """
@@ -73,8 +73,8 @@ def assembled(unknowns: Unknowns, blocks: HessianBlocks) -> PETSc.Mat:
 def _parts(hessian: TrueHessian) -> Iterator[HessianBlocks]:
     """Yield the blocks of inertia, springs, cells, pressure and contact.
 
-    Blocks of pressure and of the surface's contact, whose nodes may be another rank's, lack fixed
-    components.
+    Nodes of pressure and of surface contact may belong to other ranks. Fixed components are
+    therefore left out of their blocks here.
     """
     unknowns, t2, numbers = hessian.unknowns, hessian.t2, hessian.unknowns.numbers
     own = numbers[to_host(unknowns.free)]
@@ -112,8 +112,8 @@ def _of_springs(hessian: TrueHessian) -> Iterator[HessianBlocks]:
 def _of_cells(part: CellHessians, numbers: Indices, t2: float) -> HessianBlocks:
     """Return the blocks of the cells that this rank owns, summed over the cells.
 
-    Products with unit vectors give the matrices of all cells at once, because in the copy here
-    each cell has eight nodes of its own.
+    Products with unit vectors give the matrices of all cells at once, because here each cell is
+    copied with eight nodes of its own.
     """
     blocks, owned = part.blocks, part.blocks.owned
     nodes = to_host(blocks.nodes)[:owned]
@@ -167,7 +167,7 @@ def _of_pressure(part: PressureHessian, unknowns: Unknowns, t2: float) -> Iterat
             points.to_owner.answer(rows[points.asked])
             for rows in (unknowns.numbers, unknowns.lattice.fixed)
         )
-        # Points go by corner, then by triangle
+        # Points are ordered by corner, then by triangle
         ends = np.arange(9 * len(triangles)).reshape(3, -1, 3).swapaxes(0, 1).reshape(-1, 9)
         places = np.broadcast_arrays(ends[:, :, None], ends[:, None, :])
         matrix = csr_array((triangles.ravel(), [of.ravel() for of in places]), (ends.size,) * 2)
@@ -177,12 +177,12 @@ def _of_pressure(part: PressureHessian, unknowns: Unknowns, t2: float) -> Iterat
 
 
 def _by_component(weights: csr_array, fixed: Mask) -> csr_array:
-    """Return weights (v, n) of nodes as (3v, 3n) of their components; fixed components weigh 0."""
+    """Return weights (v, n) of nodes as (3v, 3n) of components; 0 for fixed components (n, 3)."""
     return csr_array(kron(weights, eye_array(3)) @ diags_array(np.where(fixed, 0.0, 1.0).ravel()))
 
 
 def _joined(left: csr_array, right: csr_array) -> HessianBlocks:
-    """Return the blocks of left^T right by places of nodes in the columns of both."""
+    """Return the blocks of left^T right; ``first`` and ``second`` are columns of left and right."""
     blocks = csr_array(left.T @ right).tobsr((3, 3))
     first = np.repeat(np.arange(left.shape[1] // 3), np.diff(blocks.indptr))
     return HessianBlocks(first, blocks.indices.astype(np.int64), blocks.data)

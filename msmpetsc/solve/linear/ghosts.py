@@ -12,7 +12,10 @@ from msmpetsc.solve.petsc.events import GHOSTS
 
 
 def local_numbers(columns: Indices, first: int, owned: int) -> tuple[Indices, Indices]:
-    """Return global numbers (k,) as local numbers, owned before ghosts, and the ghosts (g,)."""
+    """Return local numbers (k,) of global ``columns`` (k,), and the global numbers (g,) of ghosts.
+
+    Local numbers count owned nodes first, then ghosts.
+    """
     is_own = (columns >= first) & (columns < first + owned)
     ghosts, number = np.unique(columns[~is_own], return_inverse=True)
     local = columns - first
@@ -21,10 +24,14 @@ def local_numbers(columns: Indices, first: int, owned: int) -> tuple[Indices, In
 
 
 class Ghosted:
-    """Nodal values (l, 3), first owned nodes, then ghosts, shared with two PETSc vectors."""
+    """Nodal values (l, 3), owned nodes first, then ghosts, in memory shared with PETSc vectors."""
 
     def __init__(self, comm: MPI.Comm, owned: int, ghosts: Indices, device: Array):
-        """Take the number of owned nodes, the global numbers of ghosts, an array on the device."""
+        """Allocate zeros on the device of the array ``device`` (collective).
+
+        owned  : number of owned nodes
+        ghosts : (g,) global numbers of ghosts
+        """
         self.values = np.zeros((owned + len(ghosts), 3), like=device)
         numbers, memory = self.values.reshape(-1), memory_of(device)
         self.owned = memory.over(numbers[: 3 * owned], comm)

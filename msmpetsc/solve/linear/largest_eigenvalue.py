@@ -14,10 +14,10 @@ from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.linear.ghosts import Ghosted
 
-# relative change of omega^2 that ends the power iteration; the safety factor of
-# substeps covers its error
+# relative change of omega^2 that ends the power iteration [-]; the safety factor of
+# substeps covers the error
 SETTLED = 1e-3
-# most power iterations; later steps continue from the mode
+# greatest number of power iterations; later steps continue from the mode
 MOST_POWER_ITERATIONS = 100
 
 
@@ -36,8 +36,8 @@ class HighestMode:
         self.fixed, self.squared = lattice.fixed[: lattice.owned], 0.0
 
     def fix(self, fixed: Mask) -> None:
-        """Set the fixed components (owned, 3); start from a vector of all modes (collective)."""
-        # The vector must not depend on the number of ranks.
+        """Set the fixed components (owned, 3); start from a mixture of all modes (collective)."""
+        # The start must not depend on the number of ranks.
         self.fixed = fixed
         numbers = self.lattice.global_numbers[:, None] + np.array([0.1, 0.4, 0.7])
         self.mode.values[:] = like(self.mode.values, np.sin(1e4 * np.sin(numbers)))
@@ -67,7 +67,7 @@ class HighestMode:
         return self.squared
 
     def _normalise(self) -> float:
-        """Scale the mode x to |x|_M = 1; return |x|_M from before (collective)."""
+        """Scale the mode x to |x|_M = 1, and return |x|_M before the scaling (collective)."""
         x = self.mode.values[: self.lattice.owned]
         size = float(np.sqrt(reduced(self.comm, float(np.vdot(self.lattice.mass[:, None] * x, x)))))
         if size > 0:
@@ -88,10 +88,11 @@ def largest_eigenvalue(
 ) -> float:
     """Return an estimate of the largest eigenvalue of D^-1 H by ten CG iterations (collective).
 
+    matrix      : H
     noise       : (n,) random numbers of this rank, from 0 to 1
-    blocks      : a context of PCPYTHON that applies D^-1; otherwise D is the 3 x 3 block diagonal
-                  of the matrix
-    of_diagonal : matrix whose block diagonal is D, in place of H
+    blocks      : a context of PCPYTHON that applies D^-1; None if D is the 3 x 3 block diagonal of
+                  a matrix
+    of_diagonal : the matrix with the block diagonal D; None for H
     """
     x, b = matrix.createVecs()
     b.array[:] = noise - 0.5

@@ -1,7 +1,7 @@
-"""Matrix A, and the operators on vectors of unknowns as contexts of MATPYTHON.
+"""Matrix A and the true Hessian as operators on vectors of unknowns (contexts of MATPYTHON).
 
-A vector of unknowns is an m x 3 dense block. The scalar matrix A multiplies its three columns in a
-single product.
+A vector of unknowns is an m x 3 dense block. The scalar matrix A multiplies the three columns of
+the block in a single product.
 """
 
 import numpy as np
@@ -22,7 +22,7 @@ from msmpetsc.solve.petsc.library import petsc_csr
 
 
 class Block:
-    """Dense m x 3 matrix of PETSc, a copy of a vector of unknowns."""
+    """Dense m x 3 matrix of PETSc that holds a copy of a vector of unknowns."""
 
     def __init__(self, matrix: PETSc.Mat, memory: Memory):
         rows, _ = matrix.getSizes()
@@ -31,14 +31,14 @@ class Block:
 
     @property
     def values(self) -> Floats:
-        """Return the numbers of this rank: x, then y, then z; read or write them at once."""
+        """Return this rank's numbers, x, then y, then z, for immediate reading or writing."""
         return self.memory.values(self.mat)
 
 
 class ContactBlocks:
-    """Apply t^2 (Hessian of contact): a 3 x 3 block for each node in contact.
+    """Apply t^2 times the Hessian of contact: a 3 x 3 block for each node in contact.
 
-    parts : rows of unknowns (k,) and their blocks (k, 3, 3)
+    parts : rows of unknowns (k,) and their blocks (k, 3, 3) [kg]
     row   : (owned,) row of each node among the unknowns, -1 if pinned
     """
 
@@ -50,7 +50,10 @@ class ContactBlocks:
         self.row = like(unknowns.free, row)
 
     def linearise(self, contact: StepContactAt | None, duals: Duals | None) -> None:
-        """Compute the blocks of contact, with the duals of friction if given."""
+        """Compute the blocks of contact.
+
+        duals : duals of friction; None for its true curvature
+        """
         self.parts = []
         with CONTACT:
             for nodes, blocks in contact.hessian(duals) if contact else ():
@@ -70,7 +73,7 @@ class ContactBlocks:
 
 
 class ThreeColumns:
-    """Apply A (x) I_3 plus contact without assembling it; ``contact`` is None without contact."""
+    """Apply A (x) I_3, plus contact if given, without assembling the sum."""
 
     def __init__(self, matrix: PETSc.Mat, unknowns: Unknowns, contact: ContactBlocks | None = None):
         self.matrix, self.contact = matrix, contact
@@ -91,10 +94,10 @@ class ThreeColumns:
 
 
 class TrueHessian:
-    """Apply the true Hessian H = M + t^2 (Hessian of E and of contact), by springs or by cells.
+    """Apply the true Hessian H = M + t^2 (Hessian of E and of contact), without a matrix.
 
     products : number of products so far
-    product  : memory (l, 3) for the forces of a product
+    product  : (l, 3) memory for the forces of a product
     elastic  : Hessian of E at the last positions; None before ``linearise``
     at       : last positions (l, 3) [m], and whether the Hessian is projected
     """
@@ -130,7 +133,7 @@ class TrueHessian:
         projected : leave out the negative parts of springs, cells and contact pairs
         duals     : duals of friction, which replace its true curvature (contact.friction)
         """
-        # Free the memory of the old Hessian before the new one takes its own
+        # Free the memory of the old Hessian before the new Hessian takes memory
         self.at, self.elastic = (q, projected), None
         with HESSIAN:
             self.elastic = self.elasticity.hessian_at(q, projected)
@@ -156,7 +159,7 @@ class TrueHessian:
                 self.contact.add(x, y)
 
     def forces(self, v: Rows) -> Rows:
-        """Return the Hessian of E and of the surface's contact times v (l, 3) [m]: (l, 3) [N].
+        """Return the Hessian of E and of surface contact times v (l, 3) [m], (l, 3) [N].
 
         The next call overwrites the array.
         """
@@ -207,7 +210,7 @@ def assemble(comm: MPI.Comm, unknowns: Unknowns, time_step: float, prefix: str =
 
 
 def python_matrix(unknowns: Unknowns, context: object, comm: PETSc.Comm) -> PETSc.Mat:
-    """Return a MATPYTHON with this context on vectors of unknowns (collective)."""
+    """Return a MATPYTHON with a context, which acts on vectors of unknowns (collective)."""
     size = (3 * unknowns.size, 3 * unknowns.total)
     matrix = PETSc.Mat().createPython((size, size), context, comm=comm)
     matrix.setName(type(context).__name__)

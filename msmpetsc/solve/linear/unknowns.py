@@ -1,9 +1,9 @@
 """Numbering of the unknowns by nodes and coordinates, and ghost exchange of nodal values.
 
-Pinned nodes are not unknowns. A node that is fixed in part is an unknown. Its fixed components are
-zero in each vector of unknowns, and no operator or preconditioner changes them. On each rank, a
-vector of unknowns holds the x of the free nodes, then their y, then their z. Its local array is
-therefore an m x 3 dense block, which a scalar m x m matrix multiplies in a single product.
+Pinned nodes are not unknowns. A node that is fixed in part (a roller) is an unknown. Its fixed
+components are zero in each vector of unknowns, and no operator or preconditioner changes them. On
+each rank, a vector of unknowns holds the x of the free nodes, then their y, then their z. The local
+array is therefore an m x 3 dense block, which a scalar m x m matrix multiplies in a single product.
 """
 
 from typing import NamedTuple
@@ -23,7 +23,7 @@ from msmpetsc.solve.petsc.events import GHOSTS
 # largest integer of PETSc; its configuration decides between 32 and 64 bits
 LARGEST = int(np.iinfo(PETSc.IntType).max)
 ADVICE = "a PETSc configured with --with-64-bit-indices can"
-# inertia of static nodes in multigrid, over mass; a flat cell has a singular block
+# inertia of static nodes in multigrid [mass]; a flat cell has a singular block
 BALLAST = 1e-6
 
 
@@ -31,7 +31,7 @@ class Unknowns:
     """Number the free nodes of a lattice over all ranks, and exchange their ghosts.
 
     free    : (m,) local numbers of the free owned nodes
-    rows    : (m,) the same numbers for kernels, unsigned, which need no check of the sign
+    rows    : (m,) ``free`` as unsigned numbers, whose sign kernels need not check
     numbers : (l,) global number of each local node among the free nodes, -1 if pinned
     total   : number of free nodes on all ranks
     inertia : (owned,) [kg] mass in the residual; 0 for statics
@@ -91,13 +91,13 @@ class Unknowns:
         return self.memory.read(vector).reshape(3, self.size)
 
     def columns_to_write(self, vector: PETSc.Vec) -> Rows:
-        """Return a vector of unknowns as an array (3, m), to be written at once."""
+        """Return a vector of unknowns as an array (3, m), for immediate writing."""
         return self.memory.write(vector).reshape(3, self.size)
 
     def to_nodes(self, vector: PETSc.Vec, nodes: Array) -> None:
-        """Copy a vector of unknowns to the free rows, with ghosts, of (l, 3) (collective).
+        """Copy a vector of unknowns to the free rows of ``nodes`` (l, 3), with ghosts (collective).
 
-        Components that are fixed keep their values.
+        Fixed components keep their values.
         """
         kept = nodes[self.rollers]
         if self.has_ghosts:
@@ -118,7 +118,7 @@ class Unknowns:
         columns.reshape(-1)[self._roller_rows] = 0
 
     def projected(self, rows: Rows) -> Rows:
-        """Return rows (k, 3 m) of unknowns with their fixed components set to zero, in place."""
+        """Set the fixed components of rows (k, 3 m) of unknowns to zero; return the same rows."""
         rows[:, self._roller_rows] = 0
         return rows
 
@@ -141,7 +141,7 @@ class Unknowns:
 
 
 class VectorPool:
-    """Lend vectors of unknowns to users, and reuse the vectors afterwards.
+    """Lend vectors of unknowns, and reuse returned vectors.
 
     All ranks must destroy a vector together. Therefore the pool destroys its vectors itself, and
     Python's garbage collection destroys none.
@@ -160,7 +160,7 @@ class VectorPool:
         return self._all[-1]
 
     def lend(self, user: object, *vectors: PETSc.Vec) -> None:
-        """Return vectors to the pool when Python deletes their user."""
+        """Let vectors return to the pool when Python deletes their ``user``."""
         finalize(user, self._free.extend, vectors).atexit = False
 
     def give_back(self, vector: PETSc.Vec) -> None:
@@ -183,7 +183,10 @@ def refuse_unknowns(nodes: int) -> None:
 
 
 def refuse_nonzeros(comm: MPI.Comm, own: int) -> None:
-    """Raise InputError if a rank has more nonzeros, ``own`` of this rank, than PETSc can count."""
+    """Raise InputError if a rank has more nonzeros than PETSc can count (collective).
+
+    own : number of nonzeros of this rank
+    """
     most = comm.allreduce(own, MPI.MAX)
     if most > LARGEST:
         raise InputError(
@@ -200,7 +203,7 @@ def _spread(first: int, count: int, step: int, columns: Rows, rows: Indices, nod
 
 
 class Terms(NamedTuple):
-    """Terms of the sum M a + t^2 b at some ``rows`` of nodal arrays."""
+    """Terms of the sum M a + t^2 b at given ``rows`` of nodal arrays."""
 
     mass: Floats
     a: Array

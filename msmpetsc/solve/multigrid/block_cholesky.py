@@ -4,17 +4,17 @@ import numpy as np
 from petsc4py import PETSc
 from scipy.sparse import bsr_array, csr_array
 
-# PETSc's own bound of a pivot is absolute, but a light body has small pivots.
+# smallest pivot [kg]; PETSc's own bound is absolute, but a light body has small pivots
 LEAST_PIVOT = 1e-300
 
 
 class BlockCholesky:
     """Solve with a matrix by its Cholesky factor in blocks (a context of PCPYTHON).
 
-    The matrix gives the block size: 3 on a lattice, 1 in GAMG of A.
-    Blocks take 0.4 of the time of PETSc's factor of an AIJ, whose symbolic factorisation takes
-    longer than the numeric one. PETSc factors blocks in their given order, so they are permuted by
-    ``order`` (n,) first. Every PETSc has qmd, the common ordering with the least fill.
+    The matrix gives the block size: 3 on a lattice, 1 in GAMG of A. Blocks take 0.4 of the time of
+    PETSc's factor of an AIJ, whose symbolic factorisation takes longer than its numeric
+    factorisation. PETSc factors blocks in their given order, so ``order`` (n,) first permutes the
+    blocks. The ordering is qmd: of the orderings that every PETSc has, it has the least fill.
     """
 
     def __init__(self) -> None:

@@ -1,11 +1,11 @@
 """Copies of coarse nodes, so that coarse grids do not join the sides of a gap.
 
-The interpolation function of a coarse node spans the fine nodes around it. If their cells fall into
-several connected parts, the coarse node has a copy for each part. Each fine node then has the
-copies of its part as parents. Fine nodes are connected if they share a cell.
+The interpolation function of a coarse node spans the fine nodes around the node. If their cells
+fall into several connected parts, the coarse node has a copy for each part. Each fine node then has
+the copies of its part as parents. Fine nodes are connected if they share a cell.
 
-The parts of a coarse node follow from the cells around the node alone. So one rank receives all
-these cells, and the result does not depend on the number of ranks.
+The parts of a coarse node depend only on the cells around the node. So one rank receives all these
+cells, and the result does not depend on the number of ranks.
 """
 
 import numpy as np
@@ -19,13 +19,14 @@ from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
 from msmpetsc.geometry.partition import SortedKeys, places_of
 from msmpetsc.lattice.lattice import Lattice
 
-# index in CORNERS of an offset, from its digits ON_AXES
+# index in CORNERS of an offset, by the offset's number with place values ON_AXES
 PLACE = np.argsort(CORNERS @ [4, 2, 1])
 ON_AXES = np.array([4, 2, 1])
-# place value of each corner's copy in a number, and their limit [-]
+# place values that combine the copies of eight corners in a number, and the limit of
+# this number
 DIGITS = COPIES ** np.arange(8)
 MOST_COPIES = COPIES**8
-# fine nodes under a coarse node's function, with their copies [-]
+# number of fine nodes under a coarse node's function, with their copies
 CHILDREN = 27 * COPIES
 
 
@@ -52,11 +53,11 @@ class CoarseCopies:
     """
 
     def __init__(self, lattice: Lattice, keys: Indices, offsets: Indices):
-        """Start with a lattice.
+        """Start with the nodes and cells of a lattice.
 
-        keys    : (l,) keys of its local nodes
-        offsets : (l,) added to them, to separate bodies; 0 for a pinned node, which follows its
-                  cell
+        keys    : (l,) keys of the local nodes
+        offsets : (l,) offsets to add to the keys, to separate bodies; 0 for a pinned node, which
+                  follows its cell
         """
         corners = to_host(lattice.local_cells)[: lattice.cells_owned]
         self.cells = keys[corners] + offsets[corners].max(axis=1, keepdims=True)
@@ -70,10 +71,10 @@ class CoarseCopies:
         return self._coarsen(table, table.find(self.cells))
 
     def _coarsen(self, table: SortedKeys, index: Indices) -> Array:
-        """Replace the cells by coarse cells; return the copies (n, 8) of their nodes' parents.
+        """Replace the cells by coarse cells. Return the copies (n, 8) of the nodes' parents.
 
         table : this level's nodes
-        index : (m, 8) their indices at the cells' corners, -1 for a node without unknowns
+        index : (m, 8) indices of the nodes at the cells' corners, -1 for a node without unknowns
         """
         ijk = decode_morton(self.cells)
         low = ijk[:, 0] // 2
@@ -94,9 +95,10 @@ class CoarseCopies:
         return copies
 
     def _numbers(self, owners: SortedKeys, parents: Indices, place: Indices) -> Indices:
-        """Return the number (m, 8) of the copy of each parent that each cell belongs to.
+        """Return the numbers (m, 8) of the copies of parents to which each cell belongs.
 
-        Parts are numbered by their first nodes. The last number is shared by all further parts.
+        Parts are numbered in the order of their first nodes. If there are more parts than copies,
+        the remaining parts share the last number.
 
         place : (m,) place of each cell in its coarse cell
         """
@@ -119,7 +121,8 @@ class CoarseCopies:
 def _unite(tree: Indices, of_parent: Indices, children: Array, part: Indices) -> None:
     """Unite the children of each row (r, 8), and set the part (r,) of each row.
 
-    tree : (CHILDREN times the number of parents,) trees of children; a root is a tree's least child
+    tree : (CHILDREN times the number of parents,) trees of children; a tree's root is its least
+           child
     """
     for row in range(len(of_parent)):
         first = -1
@@ -136,10 +139,10 @@ def _unite(tree: Indices, of_parent: Indices, children: Array, part: Indices) ->
 
 
 def _distinct_cells(owners: SortedKeys, first: Indices, copies: Indices) -> Indices:
-    """Return the keys (k, 8) of the corners of coarse cells, each on one rank (collective).
+    """Return the keys (k, 8) of coarse cells' corners, each cell on a single rank (collective).
 
     first  : (m,) keys of first corners, without copies
-    copies : (m,) copies of the corners as digits of a number
+    copies : (m,) copies of the eight corners, combined by DIGITS
     """
     route = Route(owners.comm, owners.owner(first))
     place = places_of(owners.keys, route.send(first))
@@ -150,11 +153,11 @@ def _distinct_cells(owners: SortedKeys, first: Indices, copies: Indices) -> Indi
 
 
 def in_cells(low: Indices, ijk: Indices, parents: Array) -> Array:
-    """Return the copies (n, 8) of the corners of coarse cells, from parents of fine nodes in them.
+    """Return the copies (n, 8) of coarse cells' corners, from the parents of fine nodes in them.
 
-    low     : (n, 3) index of the coarse cells
-    ijk     : (n, k, 3) index of fine nodes in each cell
-    parents : (n, k, 8) copies of their parents
+    low     : (n, 3) index of each coarse cell
+    ijk     : (n, k, 3) index of each fine node in a cell
+    parents : (n, k, 8) copies of the fine nodes' parents
     """
     is_parent, place = _places(low, ijk)
     copies = np.where(is_parent, np.take_along_axis(parents, place, axis=2), 0)
@@ -163,9 +166,9 @@ def in_cells(low: Indices, ijk: Indices, parents: Array) -> Array:
 
 
 def _places(low: Indices, ijk: Indices) -> tuple[Mask, Indices]:
-    """Return which corners of coarse cells are parents of fine nodes, and their places.
+    """Return whether corners of coarse cells are parents of fine nodes, and the parents' places.
 
-    Both are (n, k, 8). A place is a column in a row of 8 parents, 0 where there is no parent.
+    Both are (n, k, 8). A place is a column in a row of 8 parents; it is 0 without a parent.
 
     low : (n, 3) index of the coarse cells
     ijk : (n, k, 3) index of fine nodes in each cell

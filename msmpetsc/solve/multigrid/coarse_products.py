@@ -1,4 +1,4 @@
-"""Single-precision products with the matrices of coarse levels on the CPU, which PETSc lacks."""
+"""Products with coarse matrices in single precision on the CPU, which PETSc lacks."""
 
 from typing import NamedTuple
 
@@ -11,7 +11,7 @@ from msmpetsc.solve.linear.ghosts import Ghosted, local_numbers
 
 
 class BlockRows(NamedTuple):
-    """3 x 3 blocks of a matrix in compressed rows.
+    """Chosen 3 x 3 blocks of a matrix, in compressed rows.
 
     begin   : (n + 1,) row i has the blocks begin[i] to begin[i + 1]
     columns : (k,) column of each block
@@ -37,15 +37,15 @@ class CoarseOperator:
     """Apply the matrix H of a coarse level in single precision. All methods are collective.
 
     Memory bandwidth limits a product. Therefore only the upper triangle is kept, in single
-    precision and with an index for each block: 0.6 kB a node instead of 2.9 kB of an AIJ. The
-    blocks act on differences of nodes, and the sums of the rows act on the nodes. Thus a
-    translation keeps its digits, even if H is stiff.
+    precision and with an index for each block: 0.6 kB a node instead of the 2.9 kB of an AIJ.
+    Blocks multiply differences between nodes, and the sums of a row's blocks multiply the nodes.
+    Thus the product with a translation keeps its digits, even if H is stiff.
 
     pattern  : symmetric AIJ of the nodes, with an entry for each block
     operator : MATPYTHON with this context
-    own      : upper triangle of the columns on this rank
+    own      : blocks of the upper triangle whose columns are on this rank
     remote   : blocks whose columns are ghosts
-    sums     : (n, 9) sums of the rows' blocks
+    sums     : (n, 9) sum of all blocks of each row
     nodes    : values of nodes in double precision, ghosts included; None on a single rank
     """
 
@@ -68,7 +68,7 @@ class CoarseOperator:
         self.operator.setUp()
 
     def update(self, blocks: Rows) -> None:
-        """Take the blocks (k, 9) of this rank's rows."""
+        """Set the blocks (k, 9) of this rank's rows."""
         self.sums[:] = np.add.reduceat(blocks, self.begin, axis=0)
         for part in (self.own, self.remote):
             part.values[:] = blocks[part.place]
@@ -93,7 +93,7 @@ class CoarseOperator:
 
 @njit(fastmath={"reassoc", "contract", "nsz"})
 def multiply_upper(blocks: BlockRows, sums: Array, x: Array, y: Array) -> None:
-    """Write H x to y for a symmetric H given by its upper blocks.
+    """Write H x to y for a symmetric H given by the blocks above its diagonal.
 
     sums : (n, 9) sum of all blocks of each row
     """
@@ -118,7 +118,7 @@ def multiply_upper(blocks: BlockRows, sums: Array, x: Array, y: Array) -> None:
 
 @njit()
 def add_product(blocks: BlockRows, x: Array, ghosts: Array, y: Array) -> None:
-    """Add H (ghosts - x) to y, with the x of each block's row."""
+    """Add the products of blocks with ghosts - x to y, with x of each block's row."""
     begin, columns, _, h = blocks
     for i in range(len(begin) - 1):
         u, v, w = x[i, 0], x[i, 1], x[i, 2]

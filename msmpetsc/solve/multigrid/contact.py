@@ -1,7 +1,7 @@
-"""Contact of the surface with itself in the multigrid cycle, on the finest and coarsest levels.
+"""Contact of surfaces in the multigrid cycle, which couples nodes on the finest and coarsest level.
 
 An active contact pair is stiff in a single direction of about forty unknowns, and stacked bodies
-move together. Diagonal blocks represent neither, because they fix each node to the ground.
+move together. Diagonal blocks represent neither, because they act as springs to the ground.
 """
 
 from itertools import zip_longest
@@ -23,19 +23,19 @@ from msmpetsc.solve.petsc.library import set_up_aij
 class ContactSmoother:
     """Smoother of the finest level with contact C = t^2 W^T H_c W between nodes.
 
-    The smoother inverts D + C, with D the block diagonal without C, by Woodbury's formula on the
+    D is the block diagonal without C. The smoother inverts D + C by Woodbury's formula on the
     points in contact:
 
         (D + C)^-1 = D^-1 - D^-1 W^T B (I + B^T G B)^-1 B^T W D^-1
         t^2 H_c = B B^T,    G = W D^-1 W^T
 
-    The pivoted Cholesky factor B keeps seven digits of a direction 1e9 times as stiff as D. If
-    H - C <= b D with b >= 1, then H <= b (D + C). Therefore Chebyshev's bound remains valid.
+    The pivoted Cholesky factor B keeps seven digits in a direction 1e9 times as stiff as D. If
+    H - C <= b D with b >= 1, then H <= b (D + C). Therefore Chebyshev's bound b remains valid.
 
     inverse : (m, 9) D^-1 [1/kg] of the free nodes
     nodes   : (c,) free nodes that carry the k points in contact
     weights : (k, c) interpolation W from nodes to points
-    middle  : (3k, 3k) factor between W^T and W
+    middle  : (3k, 3k) B (I + B^T G B)^-1 B^T
     """
 
     def __init__(self, unknowns: Unknowns, surface: SurfaceHessian, t2: float, inverse: Array):
@@ -77,8 +77,8 @@ def root_of(matrix: Rows) -> Rows:
 class CoarseContact:
     """Add contact C = t^2 (W P)^T H_c (W P) to coarse levels. All methods are collective.
 
-    The coarsest matrix has the whole of C. The levels between have its diagonal blocks only, so
-    that their nonzeros do not change.
+    The coarsest matrix gets all of C. The levels between the finest and the coarsest get only the
+    diagonal blocks of C, so that their nonzeros do not change.
 
     interpolations : P from each coarse level to the next finer level
     coarsest       : coarsest matrix with contact; None before the first contact
@@ -91,9 +91,9 @@ class CoarseContact:
     def added(
         self, coarsest: PETSc.Mat, blocks: list[Rows], surface: SurfaceHessian | None
     ) -> PETSc.Mat:
-        """Return the coarsest matrix with contact; it does not change itself.
+        """Return a copy of the coarsest matrix with contact, or the matrix itself without contact.
 
-        blocks : diagonal blocks (n, 9) of each level but the coarsest, which contact is added to
+        blocks : diagonal blocks (n, 9) of each level except the coarsest, to which contact is added
         """
         if surface is None:
             return coarsest

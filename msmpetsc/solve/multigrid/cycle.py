@@ -6,10 +6,10 @@ PETSc's options set levels, smoothers, coarse solve and cycle (-pc_mg_..., -mg_l
 The hierarchy uses the projected Hessian H, which is positive definite at any positions. Therefore
 CG with the true Hessian has a positive definite preconditioner. The finest level applies H spring
 by spring or cell by cell in single precision, with a block diagonal D in its smoother. The first
-coarse matrix is summed in the same way (solve.multigrid.galerkin). PETSc computes the coarser
-matrices as products P^T H P. P is the same for x, y and z. So PETSc multiplies the nine entries of
-the blocks one after the other, as matrices of the nodes. On a CPU all coarse levels but the last
-multiply in single precision (solve.multigrid.coarse_products).
+coarse matrix is also summed over springs or cells (solve.multigrid.galerkin). PETSc computes the
+coarser matrices as products P^T H P. P is the same for x, y and z. So PETSc multiplies the nine
+entries of the blocks one after the other, as matrices of the nodes. On a CPU all coarse levels
+except the coarsest multiply in single precision (solve.multigrid.coarse_products).
 """
 
 from collections.abc import Iterator
@@ -45,18 +45,20 @@ from msmpetsc.solve.petsc.library import (
     set_up_aij,
 )
 
-# most nodes of the coarsest grid, which is factored; coarser grids lose thin limbs
+# greatest number of nodes of the coarsest grid, whose matrix is factored; coarser grids
+# lose thin limbs
 COARSEST = 1000
-# the same, over the root of the lattice's nodes; the factor of a larger grid costs as much
-# as the finest level
+# the same, over the square root of the lattice's nodes; the factor of a larger grid takes
+# as long as the finest level
 COARSEST_ROOT = 9.0
-# most surface points that the finest smoother couples; its matrix is dense
+# greatest number of surface points that the finest smoother couples; its matrix is
+# dense
 POINTS = 200
-# lower end of a smoother's range, over its upper end; coarse grids damp the rest
+# lower end of a smoother's eigenvalue range [upper end]; coarse grids damp the rest
 RANGE_START = 0.25
-# factor on an eigenvalue estimated by ten CG iterations; the estimate is too small
+# factor on an eigenvalue estimated by ten CG iterations [-]; the estimate is too small
 SAFETY = 1.1
-# relative increase of coarse diagonals, without and with free bodies; see
+# relative increase of coarse diagonals [-], without and with free bodies; see
 # ``_raise_diagonal``
 RAISED = 1e-8, 1e-5
 # first release of PETSc that restricts by the transpose of a square matrix
@@ -65,9 +67,9 @@ TRANSPOSES_SQUARE = (3, 19)
 
 @dataclass(frozen=True)
 class Level:
-    """Coarse level.
+    """Coarse level of multigrid.
 
-    grid          : its nodes
+    grid          : nodes of the level
     interpolation : P to the next finer level
     scalar        : P (AIJ) of a single coordinate; None for the first coarse level
     pattern       : AIJ of the nodes, with an entry for each block of the level's matrix
@@ -94,10 +96,10 @@ class Multigrid:
 
     bodies : bodies of the lattice, each with its own coarse grids
     fine   : operator of the finest level
-    pc     : the PCMG, with options of the ``prefix``
+    pc     : the PCMG, with the options of the ``prefix``
     levels : coarse levels, the finest first
-    coarse : single-precision products of all coarse levels but the last; empty on a GPU
-    bounds : largest eigenvalue of D^-1 H of each level but the coarsest, the finest level first
+    coarse : single-precision products of all coarse levels except the coarsest; empty on a GPU
+    bounds : largest eigenvalue of D^-1 H of each level except the coarsest, the finest first
 
     Raises InputError for options that do not fit the lattice.
     """
@@ -125,8 +127,8 @@ class Multigrid:
     def follow(self, contact: Rows) -> None:
         """Give the finest level the present contact of each node, (owned, 9) or (0, 9) [N/m].
 
-        D gains the blocks that H gains, so that Chebyshev's bound remains. Coarse levels keep the
-        contact of the last ``update``.
+        D gains the same blocks as H, so that Chebyshev's bound remains valid. Coarse levels keep
+        the contact of the last ``update``.
         """
         self.fine.take_contact(contact)
         self.operator.assemble()
@@ -173,10 +175,10 @@ class Multigrid:
     def update(self, q: Positions, contact: Rows, surface: SurfaceHessian | None = None) -> None:
         """Build the hierarchy at positions q (l, 3) [m].
 
-        contact : (owned, 9) or (0, 9) [N/m] Hessian of contact of each node
-        surface : Hessian of the surface's contact with itself
+        contact : (owned, 9) or (0, 9) Hessian of contact of each node [N/m]
+        surface : Hessian of surface contact; None without it
         """
-        # The stiffest points couple nodes, the remaining points add to diagonal blocks.
+        # The stiffest points couple nodes; the remaining points add to diagonal blocks.
         joined, remaining = surface.split(self.fine.compliance, POINTS) if surface else (None, None)
         contact = contact + remaining.blocks if remaining else contact
         self.fine.update(q, contact, joined)
@@ -217,9 +219,9 @@ class Multigrid:
 
     @cached_property
     def sizes(self) -> list[tuple[int, int]]:
-        """Return the nodes and nonzeros of all levels, the finest first, as if all were assembled.
+        """Numbers of nodes and of nonzeros of all levels, the finest first, as if assembled.
 
-        Pairs of nodes in a cell are counted by springs.
+        The springs of a lattice count the pairs of nodes in its cells.
         """
         unknowns, lattice = self.unknowns, self.unknowns.lattice.with_springs()
         is_free = unknowns.numbers[to_host(lattice.springs)[: lattice.springs_owned]] >= 0
@@ -249,14 +251,15 @@ class Multigrid:
     def _finest_bound(self) -> float:
         """Return a bound on the eigenvalues of D^-1 H of the finest level, or an estimate by CG.
 
-        The estimate leaves out blocks of contact, because they might hide a greater eigenvalue of
-        nodes that later lose contact. As a part of D and of H they raise no eigenvalue above it.
+        The estimate leaves out the blocks of contact, because they might hide a greater eigenvalue
+        of nodes that later lose contact. The blocks are a part of both D and H, so they raise no
+        eigenvalue above the estimate.
         """
         bound, unknowns, contact = self.fine.elasticity.bound, self.unknowns, self.fine.contact
         if bound is not None:
             return bound
         noise = uniform(unknowns.numbers[to_host(unknowns.free)]).T.ravel()
-        # Surface contact waits for the next hierarchy
+        # Surface contact changes only with the next hierarchy
         follows = self.fine.joined is None and len(contact) > 0
         if follows:
             self.fine.take_contact(contact[:0])
@@ -268,7 +271,7 @@ class Multigrid:
     def coarse_blocks(self, q: Positions, contact: Rows) -> list[Rows]:
         """Return the blocks (k, 9) of the matrix of each coarse level, in the pattern's order.
 
-        contact : (owned, 9) or (0, 9) [N/m] Hessian of contact of each node
+        contact : (owned, 9) or (0, 9) Hessian of contact of each node [N/m]
         """
         of_pairs, blocks = self.sum.blocks_at(q, contact), list[Rows]()
         for entry in range(9):
@@ -285,7 +288,7 @@ class Multigrid:
         return blocks
 
     def _galerkin_product(self, finer: PETSc.Mat, level: Level) -> None:
-        """Compute P^T H P of a level from an entry of the next finer coarse level's blocks."""
+        """Compute P^T H P of a level, for the entry of the blocks that ``finer`` has."""
         with ExitStack() as options:
             for name, value in () if level.pattern else self._product_options(finer):
                 options.enter_context(replaced_option(name, value))
@@ -295,9 +298,9 @@ class Multigrid:
         """Increase a diagonal of a coarse matrix by RAISED, to make the matrix positive definite.
 
         The columns of P are linearly dependent if a coarse cell has few fine nodes. The increase
-        acts as springs to the ground. They must be soft for a clamped slender body, because bending
-        is soft, too. A free body of negligible mass needs stiffer springs: otherwise a load moves
-        it so far that single precision loses its shape.
+        acts as springs to the ground. These must be soft for a clamped slender body, because
+        bending is soft, too. A free body of negligible mass needs stiffer springs. Otherwise a load
+        moves the body so far that single precision loses its shape.
         """
         diagonal = matrix.getDiagonal()
         diagonal.scale(1 + RAISED[int(self.bodies.free.any())])
@@ -308,8 +311,8 @@ class Multigrid:
         """Yield our defaults for PETSc's options of the product P^T H P."""
         given = PETSc.Options().getAll()
         if "matptap_via" not in given:
-            # PETSc's default sums messages in the order of arrival, which varies.
-            # On one rank rap takes a third of its time.
+            # PETSc's default sums messages in their order of arrival, which varies.
+            # On one rank rap takes a third of the default's time.
             yield "matptap_via", "allatonce" if matrix.comm.size > 1 else "rap"
         # The product of PETSc 3.26 on an H100 is wrong: it is 0.
         if self.unknowns.memory is device.CUDA and "matptap_backend_cpu" not in given:
@@ -338,9 +341,9 @@ class Multigrid:
     def _restriction(self, interpolation: Interpolation) -> PETSc.Mat:
         """Return the restriction P^T as a matrix of its own.
 
-        PETSc recognises the restriction by its shape, which fails for a square P. For a square
-        matrix, PETSc 3.22 multiplies by the transpose and PETSc 3.18 by the matrix itself. PETSc
-        3.22 fails for a MATTRANSPOSE as well.
+        PETSc tells by the shape whether a matrix restricts or interpolates, which fails for a
+        square P. For a square matrix, PETSc 3.22 multiplies by the transpose and PETSc 3.18 by the
+        matrix itself. PETSc 3.22 fails for a MATTRANSPOSE as well.
         """
         fine, coarse = interpolation.operator.getSizes()
         is_transposed = fine[1] == coarse[1] and PETSc.Sys.getVersion() >= TRANSPOSES_SQUARE
@@ -356,8 +359,8 @@ class Multigrid:
     def _read_options(self) -> None:
         """Read PETSc's options. Raises InputError for a smoother that needs a finest matrix.
 
-        The user's pc_type does not count here: a system may be exported beside steps with another
-        preconditioner.
+        The user's pc_type does not count here, because a system may be exported from a run whose
+        steps have another preconditioner.
         """
         options = PETSc.Options(self.prefix)
         for name in ("mg_levels_pc_type", f"mg_levels_{len(self.levels)}_pc_type"):
@@ -379,7 +382,7 @@ class Multigrid:
 def set_blocks(
     matrix: PETSc.Mat, pattern: PETSc.Mat, begin: Indices, columns: Indices, blocks: Rows
 ) -> None:
-    """Set a matrix (AIJ of block size 3) to blocks, and create it first if it is new (collective).
+    """Set a matrix (AIJ of block size 3) to blocks; create a new matrix first (collective).
 
     pattern : a matrix of the nodes, of the same type
     begin   : (n + 1,) row i has the blocks (k, 9) from begin[i] to begin[i + 1]

@@ -1,4 +1,4 @@
-"""Finest level of multigrid: the projected Hessian without a matrix, and its diagonal blocks."""
+"""Finest level of multigrid: the matrix-free projected Hessian, and its diagonal blocks."""
 
 from typing import NamedTuple
 
@@ -22,10 +22,12 @@ class ProjectedHessian:
 
     products   : number of products so far
     diagonal   : (m, 6) upper triangles of D without contact [kg]
-    inverse    : (m, 9) D^-1 [1/kg], zero in fixed components
+    inverse    : (m, 9) D^-1 with contact of nodes [1/kg], zero in fixed components
     moves      : (m, 3) bool, the components that are not fixed
+    contact    : (owned, 9) or (0, 9) diagonal blocks of contact [N/m]
     touched    : nodes with contact
-    compliance : (owned,) [m/N] estimated compliance of a node at rest
+    joined     : surface contact that couples nodes; None without it
+    compliance : (owned,) estimated compliance of a node at rest [m/N]
     """
 
     def __init__(self, unknowns: Unknowns, elasticity: Elasticity, t2: float):
@@ -52,10 +54,10 @@ class ProjectedHessian:
     def update(self, q: Positions, contact: Rows, joined: SurfaceHessian | None = None) -> None:
         """Compute H and D^-1 at positions q (l, 3) [m].
 
-        contact : (owned, 9) or (0, 9) [N/m] diagonal blocks of contact
-        joined  : contact of the surface that couples nodes
+        contact : (owned, 9) or (0, 9) diagonal blocks of contact [N/m]
+        joined  : surface contact that couples nodes; None without it
         """
-        # Free the memory of the old Hessian before the new one takes its own
+        # Free the memory of the old Hessian before the new Hessian takes memory
         self.elastic = None
         self.elastic = self.elasticity.hessian_at(q, projected=True, dtype=np.float32)
         self.joined = joined
@@ -91,7 +93,7 @@ class ProjectedHessian:
             self.unknowns.scaled_sum(self.v, self.t2, self.product, y)
 
     def by_blocks(self, x: Rows, y: Rows) -> Rows:
-        """Write D^-1 x (3, m) to y, contact of the surface included, and return y."""
+        """Write (D + C)^-1 x (3, m) to y, with surface contact C, and return y."""
         apply_blocks(self.unknowns.size, x, self.inverse, y)
         if self.smoother:
             self.smoother.correct(y)
@@ -99,7 +101,7 @@ class ProjectedHessian:
 
 
 class DiagonalBlocks:
-    """Apply the inverse of the finest level's 3 x 3 diagonal blocks (a context of PCPYTHON)."""
+    """Apply the inverse of D + C, the finest level's blocks and surface contact (for PCPYTHON)."""
 
     def __init__(self, hessian: ProjectedHessian):
         self.hessian = hessian
@@ -136,7 +138,7 @@ class FreeNodes(NamedTuple):
 
     free    : (m,) numbers of the free nodes
     moves   : (m, 3) bool, the components that are not fixed
-    contact : (owned, 9) or (0, 9) [N/m] diagonal blocks of contact
+    contact : (owned, 9) or (0, 9) diagonal blocks of contact [N/m]
     t2      : t^2 [s^2]
     """
 
@@ -150,9 +152,9 @@ class FreeNodes(NamedTuple):
 def invert_blocks(
     first: int, count: int, step: int, inverse: Array, diagonal: Rows, nodes: FreeNodes
 ) -> None:
-    """Invert the blocks D + t^2 contact of components that are not fixed.
+    """Write the inverse (m, 9) of the blocks D + t^2 contact, over components that are not fixed.
 
-    diagonal : (m, 6) upper triangles of D [kg]
+    diagonal : (m, 6) upper triangles of D without contact [kg]
     """
     free, moves, contact, t2 = nodes
     for i in range(first, count, step):

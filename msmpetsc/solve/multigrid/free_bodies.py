@@ -1,7 +1,7 @@
 """Separate bodies in multigrid, and exact translations of free bodies.
 
 A body is a set of free nodes joined by springs or cells. Pinned nodes separate bodies. Each body
-has its own coarse grids. With T the translations of the free bodies and
+has its own coarse grids. With the translations T of the free bodies, and
 Q = T (T^T M T)^-1 T^T M, a cycle B becomes
 
     (I - Q) B (I - Q)^T + T (T^T M T)^-1 T^T.
@@ -29,7 +29,8 @@ class Bodies:
     """Bodies of a lattice.
 
     number : (l,) body of each local node, -1 if pinned
-    free   : (b, 3) bool, whether no node of the body, or joined with it, is fixed along each axis
+    free   : (b, 3) bool, whether the body is free along each axis: no node of the body, or joined
+             with the body, is fixed along the axis
     """
 
     number: Indices
@@ -38,12 +39,12 @@ class Bodies:
     def offsets(self, comm: MPI.Comm, keys: Indices) -> Indices:
         """Return the offsets (l,) to add to the nodes' keys, so that bodies separate (collective).
 
-        Shifted along the first axis, bodies share no coarse cell. Pinned nodes have offset 0. If
-        the grid indices have no room, all offsets are 0.
+        The offsets shift bodies along the first axis, so that they share no coarse cell. Pinned
+        nodes have offset 0. If the grid indices have no room, all offsets are 0.
         """
         farthest = reduced(comm, int(decode_morton(keys).max(initial=0)), MPI.MAX)
         # A power of two above the extent separates bodies on coarser grids as well. It
-        # has none of the bits of the nodes, so its key may be added to theirs.
+        # shares no bit with the nodes' indices, so keys may be added.
         room = 2 << farthest.bit_length()
         shift = np.maximum(self.number, 0) * (room if len(self.free) * room <= LIMIT else 0)
         return encode_morton(shift[:, None] * np.array([1, 0, 0]))
@@ -79,7 +80,7 @@ def _labels(unknowns: Unknowns, part: Indices) -> Indices:
 
     Ranks that share a body exchange their smallest numbers until no number changes.
 
-    part : (l,) connected part of this rank's nodes that each node belongs to
+    part : (l,) number of each node's connected part on this rank
     """
     comm, lattice = unknowns.comm, unknowns.lattice
     to_owner = Route(comm, lattice.table.owner_of_index(lattice.ghosts))
@@ -100,7 +101,7 @@ def _labels(unknowns: Unknowns, part: Indices) -> Indices:
 class Translations:
     """Treat translations of free bodies exactly in a multigrid cycle. All methods are collective.
 
-    A body that is fixed along some axes is free along the others.
+    A body that is fixed along some axes is free along the remaining axes.
 
     count   : number b of free bodies
     free    : (3, b) 1 along the axes on which each free body is free, otherwise 0
@@ -119,12 +120,12 @@ class Translations:
         self.of_body = self._sums(self.mass[None])[0]
 
     def means(self, forces: Rows) -> Rows:
-        """Return the columns (3, b + 1) of (T^T M T)^-1 T^T f of forces f (3, m); the last is 0."""
+        """Return the columns (3, b + 1) of (T^T M T)^-1 T^T f for forces f (3, m), then zeros."""
         moved = self.free * self._sums(forces) / self.of_body
         return like(forces, np.append(moved, np.zeros((3, 1)), axis=1))
 
     def around(self, cycle: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Apply a cycle with exact translations to x; write the result to y."""
+        """Apply a cycle with exact translations to x, and write the result to y."""
         unknowns = self.unknowns
         forces, rest = unknowns.columns(x), x.duplicate()
         whole = self.means(forces)

@@ -6,8 +6,7 @@ weights (8,) of the cell's corners at end a of a spring, or 0 if the end is pinn
 
 - a spring with block B: (w_a - w_b)(w_a - w_b)^T (x) t^2 B
 - a node of mass m with contact block C: w w^T (x) (m I + t^2 C)
-- a fixed component of a node that is fixed in part: a spring to the ground, GROUND times as stiff
-  as the node
+- a fixed component of a roller: a spring to the ground, GROUND times as stiff as the node
 - a solid cell: its Hessian in the strains of the coarse corners (elasticity.neo_hookean)
 """
 
@@ -40,16 +39,17 @@ from msmpetsc.solve.multigrid.coarse_copies import DIGITS, MOST_COPIES, in_cells
 from msmpetsc.solve.multigrid.grids import CoarseGrid
 from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo
 
-# code of a pinned node; a node at (i, j, k) in its coarse cell has 9 i + 3 j + k
+# code of a pinned node; a node at (i, j, k) in its coarse cell has the code
+# 9 i + 3 j + k
 PINNED = 27
 # the upper triangle in a 3 x 3 block, and the diagonal in the upper triangle
 UPPER, DIAGONAL = [0, 1, 2, 4, 5, 8], [0, 3, 5]
-# place in a 3 x 3 block of each entry of its transpose
+# place in a 3 x 3 block of each entry of the block's transpose
 TRANSPOSED = [0, 3, 6, 1, 4, 7, 2, 5, 8]
-# stiffness of the spring that holds a fixed component on coarse levels, over its node's
-# stiffness [-]; fixed components must be much stiffer than components that move
+# stiffness of the spring that holds a fixed component on coarse levels [stiffness of
+# the node]; much stiffer than components that move
 GROUND = 100.0
-# entries of a row of ``_write_coarse`` [-]
+# number of entries in a row of ``_write_coarse``
 COARSE = 41
 # pairs (36, 2) of corners: the upper triangle of a cell's matrix
 PAIRS = np.array([(p, q) for p in range(8) for q in range(p, 8)])
@@ -65,7 +65,7 @@ def _weights() -> Rows:
 class Products(NamedTuple):
     """Nonzeros of the outer products w w^T of weights (n, 8), in compressed rows.
 
-    begin  : (n + 1,) product i has the entries begin[i] to begin[i + 1]
+    begin  : (n + 1,) product i has the entries begin[i] : begin[i + 1]
     pair   : (k,) index of each entry in PAIRS
     factor : (k,) value of each entry
     """
@@ -96,8 +96,8 @@ class ByCell(NamedTuple):
 
     start : (c + 1,) coarse cell i has the items order[start[i] : start[i + 1]]
     order : (n,) numbers of the items
-    code  : (n, k) position codes in the coarse cell of the k ends or corners of each item, in the
-            order of ``order``
+    code  : (n, k) codes of the positions of each item's k ends or corners in the coarse cell, in
+            the order of ``order``
     """
 
     start: Indices
@@ -106,7 +106,13 @@ class ByCell(NamedTuple):
 
     @classmethod
     def of(cls, cells: Indices, keys: Indices, code: Indices, which: Indices) -> "ByCell":
-        """Return items (n,) sorted by their cells' keys (n,), given all keys (c,) ascending."""
+        """Return items sorted by their coarse cells.
+
+        cells : (n,) key of each item's coarse cell
+        keys  : (c,) all keys, ascending
+        code  : (n, k) position codes of each item
+        which : (n,) number of each item
+        """
         by_cell = np.argsort(cells, kind="stable")
         start = np.searchsorted(cells[by_cell], keys, side="left")
         start = np.append(start, len(cells)).astype(np.int32)
@@ -118,7 +124,7 @@ class ByCell(NamedTuple):
 
 
 class PairSum(NamedTuple):
-    """Sum of the blocks of springs or nodes.
+    """Sum of the blocks of springs or nodes over the coarse cells.
 
     values   : (b, 6) upper triangles of the blocks
     places   : (c, 36) block of each pair of a coarse cell's corners, -1 if there is none
@@ -132,7 +138,7 @@ class PairSum(NamedTuple):
 
 
 class CellSum(NamedTuple):
-    """Sum of the blocks of fine cells.
+    """Sum of the blocks of fine cells over the coarse cells.
 
     values  : (b, 9) blocks
     places  : (c, 36) block of each pair of a coarse cell's corners, -1 if there is none
@@ -151,11 +157,12 @@ class GalerkinSum:
     On a CPU, all cells add to the blocks of this rank's pairs of nodes. On a GPU, each cell has its
     own blocks, which PETSc sums.
 
+    grid    : the first coarse grid
     keys    : (l,) key of each local node
     offsets : (l,) key of the offset of each node's body (free_bodies.Bodies.offsets)
     copies  : (l, 8) copies of each node's parents (multigrid.coarse_copies)
     stiff   : (owned,) stiffness of each node at rest [N/m]
-    pattern : AIJ of the nodes, with an entry for each block
+    pattern : AIJ of the coarse nodes, with an entry for each block
     """
 
     def __init__(
@@ -180,7 +187,7 @@ class GalerkinSum:
             Products(*(like(lattice.nodes, part) for part in products))
             for products in (of_springs, OF_NODES)
         )
-        # Places and stiffnesses [kg] of the springs that hold rollers
+        # Places, and stiffnesses times t^2 [kg], of the springs that hold rollers
         node, component = (rows[lattice.rollers[0] < lattice.owned] for rows in lattice.rollers)
         self.rollers = node, like(node, np.array(DIAGONAL))[component]
         self.ground = GROUND * t2 * stiff[node]
@@ -191,7 +198,7 @@ class GalerkinSum:
         self.pattern = self._create_pattern(grid, first, second, upper)
 
     def _pairs(self, grid: CoarseGrid, corners: Indices) -> tuple[Indices, Indices, Indices]:
-        """Return the pairs of nodes (b,), (b,) with a block, and each cell's blocks (c, 36).
+        """Return first and second nodes (b,) of all blocks, and the numbers of blocks (c, 36).
 
         corners : (c, 8) keys of the cells' corners
         """
@@ -209,7 +216,11 @@ class GalerkinSum:
     def _create_pattern(
         self, grid: CoarseGrid, first: Indices, second: Indices, upper: Indices
     ) -> PETSc.Mat:
-        """Return the matrix with entries of the pairs; ``upper`` adds transposes (collective)."""
+        """Return a matrix with an entry for each pair, and for transposed pairs (collective).
+
+        first, second : (b,) nodes of each pair
+        upper         : numbers of the pairs that also have a transposed entry
+        """
         comm = self.unknowns.comm
         # Only a GPU has a matrix of all unknowns on this level.
         entries = 1 if on_host(self.unknowns.lattice.nodes) else 9
@@ -222,14 +233,14 @@ class GalerkinSum:
         return pattern
 
     def set_entries(self, blocks: Rows, entry: int) -> None:
-        """Set the pattern to an entry, 0 to 8, of the pairs' ``blocks`` (b, 9) (collective)."""
+        """Set the pattern's values to one entry, 0 to 8, of ``blocks`` (b, 9) (collective)."""
         below = blocks[self.upper, TRANSPOSED[entry]]
         set_values_coo(self.pattern, np.concatenate([blocks[:, entry], below]))
 
     def blocks_at(self, q: Positions, contact: Rows) -> Rows:
         """Return the blocks (b, 9) of this rank's pairs at positions q (l, 3) [m].
 
-        contact : (owned, 9) or (0, 9) [N/m] Hessian of contact of each node
+        contact : (owned, 9) or (0, 9) Hessian of contact of each node [N/m]
         """
         count = len(self.places)
         symmetric = np.zeros((self.blocks, 6), like=q)
@@ -255,7 +266,7 @@ class GalerkinSum:
 def _by_cell(
     unknowns: Unknowns, elasticity: Elasticity, ijk: Indices, offsets: Indices, parents: Array
 ) -> tuple[Indices, ByCell, ByCell, ByCell]:
-    """Return the corners' keys of this rank's coarse cells, and its springs, nodes and cells.
+    """Return the keys of coarse cells' corners (c, 8), and springs, nodes and cells by coarse cell.
 
     parents : (l, 8) copies of each node's parents
     """
@@ -297,7 +308,7 @@ def _by_cell(
 
 
 def _copies_of_corners(low: Indices, ijk: Indices, nodes: Indices, parents: Array) -> Indices:
-    """Return the copies of the corners of each item's coarse cell as digits of a number (n,).
+    """Return the copies of the corners of each item's coarse cell, combined by DIGITS, (n,).
 
     low     : (n, 3) index of the coarse cells
     ijk     : (l, 3) index of the fine nodes
@@ -353,9 +364,9 @@ def add_nodes(first: int, count: int, step: int, own: Rows, into: PairSum) -> No
 def add_solid(
     first: int, count: int, step: int, scratch: Array, into: CellSum, cells: CellRows
 ) -> None:
-    """Add t^2 times the Hessians of fine cells, whose corners are interpolated from coarse corners.
+    """Add t^2 times the Hessians of fine cells, with corners interpolated from coarse corners.
 
-    scratch : (s, 8, COARSE) rows of ``_write_coarse``; coarse cell i uses row i % s
+    scratch : (s, 8, COARSE) memory for ``_write_coarse``; coarse cell i uses part i % s
     """
     values, places, by_cell, weights = into
     for i in range(first, count, step):
@@ -381,10 +392,10 @@ def add_solid(
 
 @njit(inline="always")
 def _write_coarse(rows: Rows, weights: Rows, code: Array, cells: CellRows, k: int, s: int) -> None:
-    """Write a row (COARSE,) for each coarse corner of a fine cell.
+    """Write a row (COARSE,) for each corner of the coarse cell around a fine cell.
 
-    A row has the strain of a unit displacement (7), ``full_forces`` (4), cof F g (3) and
-    ``corner_tensions`` (27).
+    A row has the fine cell's strain by a unit displacement of the corner (7), ``full_forces`` (4),
+    cof F g (3) and ``corner_tensions`` (27).
     """
     f, rest = kept_gradient(cells.state, s), rest_constants(cells.constants, k)
     n = cofactors(f)
@@ -406,7 +417,7 @@ def _write_coarse(rows: Rows, weights: Rows, code: Array, cells: CellRows, k: in
 
 @njit(inline="always")
 def _add_bending(block: Floats, n: Three, g: Floats, h: Floats) -> None:
-    """Add the coupling of two corners by bending and twist, for fixed directions n."""
+    """Add the coupling of two corners by bending and twist, with directions n fixed."""
     for axis in range(3):
         at = 14 + 9 * axis
         x = g[3] * h[at] + g[4] * h[at + 3] + g[5] * h[at + 6]

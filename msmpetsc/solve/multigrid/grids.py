@@ -18,7 +18,8 @@ from msmpetsc.geometry.partition import SortedKeys
 from msmpetsc.solve.linear.unknowns import Unknowns, refuse_unknowns
 from msmpetsc.solve.multigrid.coarse_copies import CoarseCopies
 
-# most nodes of a coarse grid, over the finer grid's; a larger grid does not pay
+# greatest number of nodes of a coarse grid [nodes of the finer grid]; a larger grid
+# does not pay
 SHRINK = 0.7
 
 
@@ -26,7 +27,7 @@ SHRINK = 0.7
 class CoarseGrid:
     """Nodes of a coarse level.
 
-    table  : their Morton keys, which number them over all ranks
+    table  : Morton keys of the nodes, which number the nodes over all ranks
     copies : (n, 8) copies of the parents of this rank's finer nodes (multigrid.coarse_copies)
     """
 
@@ -41,9 +42,9 @@ def node_keys(unknowns: Unknowns) -> Indices:
 
 
 def parents_of(keys: Indices, copies: Array) -> tuple[Indices, Mask]:
-    """Return the keys (n, 8) of the parents of nodes (n,), and a mask (n, 8).
+    """Return the keys (n, 8) of the parents of nodes (n,), and a mask (n, 8) of parents that exist.
 
-    Corners that lie beyond an even index have no weight; the mask leaves them out.
+    Along an axis with an even index, a node has one parent, not two.
 
     copies : (n, 8) numbers of the parents' copies (solve.multigrid.coarse_copies)
     """
@@ -68,8 +69,8 @@ def grids(
 
     free     : (n,) local numbers of the nodes in the lattice
     total    : number of nodes on all ranks
-    coarsest : most nodes of the last grid, if ``count`` is None
-    count    : number of grids
+    coarsest : greatest number of nodes of the last grid, if ``count`` is None
+    count    : number of grids; None for as many as ``coarsest`` needs
     """
     levels: list[CoarseGrid] = []
     while not levels or (total > coarsest if count is None else len(levels) < count):
@@ -85,9 +86,9 @@ def grids(
 
 
 def interpolation(keys: Indices, grid: CoarseGrid) -> csr_array:
-    """Return the interpolation P of a coordinate to finer nodes with keys (n,) (collective).
+    """Return the interpolation P (n, total) of a coordinate to finer nodes (n,) (collective).
 
-    The rows are the finer nodes, the columns all coarse nodes.
+    keys : (n,) keys of the finer nodes, the rows of P; its columns are all coarse nodes
     """
     parents, needed = parents_of(keys, grid.copies)
     count = needed.sum(axis=1)

@@ -28,7 +28,7 @@ class Interpolation:
     """Apply P from a coarse grid to finer nodes, and P^T (a context of MATPYTHON).
 
     P is the same for x, y and z, and the parents of a node have equal weights. So lists of parents
-    and of children replace an AIJ: 32 bytes a finer node instead of 134.
+    and children replace an AIJ, with 32 bytes a finer node instead of 134.
 
     parents  : coarse nodes of each finer node, by local numbers
     children : finer nodes of each local coarse node
@@ -39,11 +39,11 @@ class Interpolation:
     def __init__(
         self, comm: MPI.Comm, rows: csr_array, grid: CoarseGrid, device: Array, first: bool
     ):
-        """Take P of a coordinate.
+        """Build the lists from the matrix P of a coordinate.
 
-        rows   : this rank's rows (n, total)
+        rows   : this rank's rows of P (n, total)
         device : an array on the device of the vectors
-        first  : see ``is_first``
+        first  : value of ``is_first``
         """
         table, columns = grid.table, rows.indices
         self.own, self.first, self.is_first = len(table.keys), table.first, first
@@ -92,7 +92,7 @@ class Interpolation:
         return values.reshape(3, -1).T if self.is_first else values.reshape(-1, 3)
 
     def rows(self) -> csr_array:
-        """Return P of a coordinate with global columns, this rank's rows (n, total)."""
+        """Return this rank's rows (n, total) of the matrix P of a coordinate."""
         begin, nodes = map(to_host, self.parents)
         count = np.diff(begin)
         numbers = np.append(self.first + np.arange(self.own), self.ghosts)[nodes]
@@ -123,7 +123,7 @@ def add_means(first: int, count: int, step: int, y: Rows, x: Rows, parents: List
 def sum_shares(
     first: int, count: int, step: int, y: Rows, x: Rows, children: Lists, parents: Lists
 ) -> None:
-    """Write the sum of the shares of each node's children in x (n, 3) to y (c, 3)."""
+    """Write to y (c, 3) the sum over each node's children of their x (n, 3) / number of parents."""
     begin, nodes = children
     for i in range(first, count, step):
         a, b, c = 0.0, 0.0, 0.0

@@ -1,13 +1,13 @@
 """Start of a step with moving anchors or obstacles: a path to their places that crosses nothing.
 
 The share s of the path of anchors and obstacles is a further unknown: s = 0 at the beginning of the
-step, and s = 1 is the target. Newton's direction towards the minimum of g at s = 1 moves both,
+step, and s = 1 is the target. Newton's direction towards the minimum of g at s = 1 moves x and s,
 
     H(x, s) dx = -F(x, s) - (1 - s) dF/ds(x, s),      ds = 1 - s,
 
 until two triangles would cross. So bodies give way to the obstacles that press them, as to the
-moving boundaries of Li et al. (2020, Incremental Potential Contact). H is projected, and no line
-search evaluates g, since the path only has to arrive.
+moving boundaries of Li et al. (2020, Incremental Potential Contact). H is projected. No line search
+evaluates g, since the path only has to reach s = 1.
 
 A start without a linear solve is tried first: nodes move with the obstacles near them.
 """
@@ -25,26 +25,26 @@ from msmpetsc.errors import StepFailed, StepStopped
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 from msmpetsc.solve.nonlinear.jacobian import Jacobian
 
-# Directions between checks of the progress; a press takes 5 to 30
+# Number of directions between checks of the progress; pressing a body takes 5 to 30
 PATIENCE = 20
 # Least progress in s between checks; with less progress the step is refused
 PROGRESS = 0.1
-# Corrections at fixed s before each share; a correction doubles a gap that the last
-# share has closed
+# Number of corrections at fixed s before each move; a correction doubles a gap that the
+# last move has closed
 CORRECTIONS = 2
 
 
 class CarriedStart:
-    """Start of steps that carries bodies along with anchors and obstacles.
+    """Finder of starts that carry bodies along with anchors and obstacles.
 
     All methods are collective.
 
-    ksp : solves with the Jacobian
+    ksp : solver of systems with the Jacobian
     """
 
     def __init__(self, functional: StepFunctional, jacobian: Jacobian, ksp: PETSc.KSP):
         self.functional, self.jacobian, self.ksp = functional, jacobian, ksp
-        # Tolerances of the options, since Newton's method changes those of ``ksp``
+        # Tolerances of the options; Newton's method changes the tolerances of ``ksp``
         self.rtol, _, _, self.most_its = ksp.getTolerances()
 
     def find(self, guess: Positions, drift: Callable[[Rows], Rows | float]) -> Positions:
@@ -52,8 +52,8 @@ class CarriedStart:
 
         drift : returns the mean displacement of a free body from displacements (l, 3) [m]
 
-        Raises StepFailed if anchors and obstacles cannot reach their places; StepStopped after a
-        signal.
+        Raises StepFailed if anchors and obstacles cannot reach their places, and StepStopped after
+        a signal.
         """
         functional, problem = self.functional, self.functional.problem
         contacts = functional.surface.contacts if functional.surface else None
@@ -82,9 +82,9 @@ class CarriedStart:
             contacts.time, functional.problem, obstacles.straight = end, problem, None
 
     def _moved_with_obstacles(self, contacts: ContactSearch, moved: Rows) -> Rows:
-        """Return displacements (l, 3) [m] of nodes.
+        """Return displacements (l, 3) [m] with which nodes follow the obstacles that they touch.
 
-        Nodes go with the obstacles that they touch, other nodes by ``moved``.
+        Nodes far from obstacles have the displacements ``moved``.
         """
         functional, q = self.functional, self.functional.problem.q
         owned = contacts.points.distances(q, contacts.begin) - contacts.law.distance
@@ -127,7 +127,8 @@ class CarriedStart:
     def _direction(self, q: Positions, fixed: Rows, obstacles: Rows) -> Rows:
         """Return Newton's direction (l, 3) [m] at q (l, 3) [m], fixed nodes included.
 
-        fixed, obstacles : displacements of fixed nodes (l, 3) and obstacles' points (o, 3) [m]
+        fixed     : (l, 3) displacements of fixed nodes [m]
+        obstacles : (o, 3) displacements of obstacles' points [m]
 
         Raises StepStopped after a signal.
         """

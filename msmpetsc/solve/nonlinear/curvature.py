@@ -2,9 +2,9 @@
 
 F vanishes on a saddle of g, too, and a symmetric start never leaves the saddle. A pass over springs
 or cells bounds the negative parts of H. If they are small enough, H is positive definite. Otherwise
-the lowest eigenvalue of M^(-1) H is computed (nonlinear.lobpcg). A long search is made if the
-compression has grown or if a solve has met a negative curvature. At all other steps a few
-iterations follow the last mode if its curvature has changed.
+the lowest eigenvalue of M^(-1) H is computed (nonlinear.lobpcg). If the compression has grown, or
+if a solve has met a negative curvature, the search is long. Otherwise a few iterations follow the
+last mode if its curvature has changed.
 """
 
 from dataclasses import dataclass
@@ -30,17 +30,17 @@ from msmpetsc.solve.nonlinear.lobpcg import (
 )
 from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 
-# Modes of at least this share of the lowest negative curvature count as equally steep
+# Share of the lowest negative curvature from which modes count as equally steep [-]
 ALIKE = 0.9
 # Growth of the compression, or of the mode's curvature, beyond which another mode may
-# be the lowest
+# be the lowest [-]
 MORE = 1.5
-# Relative change of the mode's curvature below which the mode is taken as it is
+# Relative change of the mode's curvature up to which the mode is not searched again [-]
 UNCHANGED = 0.1
 
 
 class Alarm(IntEnum):
-    """Place of a negative curvature that a solve has met: here, or at an earlier iterate."""
+    """Place of a negative curvature that a solve has met: at this iterate or an earlier iterate."""
 
     NOWHERE = 0
     ON_THE_WAY = 1
@@ -49,11 +49,11 @@ class Alarm(IntEnum):
 
 @dataclass(frozen=True)
 class Compression:
-    """Compression of a body: t^2 concavity / m of the free nodes of all ranks.
+    """Compression of a body: t^2 concavity / m [-] over the free nodes of all ranks.
 
     greatest : greatest value
-    total    : sum
-    inertia  : whether M is part of H and outweighs negative parts of the elastic Hessian
+    total    : sum of all values
+    inertia  : whether M is part of H, so that it may outweigh negative parts; False in statics
     """
 
     greatest: float = 0.0
@@ -62,10 +62,7 @@ class Compression:
 
     @property
     def least_curvature(self) -> float:
-        """Lower bound of the eigenvalues of M^(-1) H.
-
-        0 if M may not outweigh the negative parts.
-        """
+        """Lower bound of the eigenvalues of M^(-1) H; 0 if M may not outweigh negative parts."""
         return max(1 - self.greatest, 0.0) if self.inertia else 0.0
 
 
@@ -77,7 +74,7 @@ class LowestCurvature:
 
     All methods but properties are collective.
 
-    preconditioner : of the step's linear solves
+    preconditioner : preconditioner of the step's linear solves
     """
 
     state: ClassVar[dict[str, Range]] = {
@@ -96,8 +93,8 @@ class LowestCurvature:
         self.products = 0
         # Compression at which the last long search was made
         self.searched = NONE
-        # Lowest known mode (n,), of unit length in the norm of M, and its curvature
-        # when it was found
+        # Lowest known mode (n,), of unit length in the norm of M, and the curvature
+        # with which it was found
         self.mode: Floats | None = None
         self.value = 0.0
         # Whether the last checkpoint has the mode
@@ -105,7 +102,7 @@ class LowestCurvature:
 
     @property
     def effort(self) -> SearchEffort:
-        """Effort of a search with the present preconditioner."""
+        """Effort of searches with the present preconditioner."""
         return UNIFORM_EFFORT if self.preconditioner.is_uniform else EFFORT
 
     def compression(self, q: Positions) -> Compression:
@@ -124,6 +121,8 @@ class LowestCurvature:
     ) -> tuple[float, Floats | None]:
         """Return the lowest eigenvalue of M^(-1) H that a search finds, and its direction (n,).
 
+        The eigenvalue is -inf at springs of zero length.
+
         q    : positions (l, 3) [m] at which H was linearised last
         hint : a direction that may contain the mode
         """
@@ -136,9 +135,9 @@ class LowestCurvature:
             return -np.inf, self.search.random(1)[0]
         self.mode, self.value = modes[0].copy(), float(values[0])
         if values[0] < 0:
-            # A body may buckle equally to several sides; rounding orders these modes.
-            # The projection of noise on them does not depend on their order, so any
-            # number of ranks takes the same side.
+            # A body may buckle equally to several sides, and rounding orders these
+            # modes. The projection of noise onto the modes does not depend on their
+            # order, so any number of ranks takes the same side.
             down = modes[: int((values <= ALIKE * values[0]).sum())]
             noise = self.search.random(1)[0]
             parts = reduced(self.comm, to_host((down * self.functional.mass) @ noise))
@@ -165,8 +164,8 @@ class LowestCurvature:
     def _followed(self) -> tuple[Floats, Rows] | None:
         """Return the lowest curvatures and their modes near the last mode.
 
-        Return None without a last mode, or if the mode has stiffened so much that another mode may
-        be the lowest now.
+        Return None without a last mode. Return None, too, if the mode has stiffened so much that
+        another mode may be the lowest now.
         """
         if self.mode is None:
             return None
@@ -186,8 +185,8 @@ class LowestCurvature:
 
         A search from a known mode finds a lower mode late, so this search starts from random
         vectors, which have parts of all modes. Rigid motions have a curvature of about 1 and would
-        delay a lower mode in the same way, so they are left out at first. A second search starts
-        from these modes, the known mode and the rigid motions.
+        delay a lower mode in the same way, so the first search leaves them out. A second search
+        starts from the modes found, the known mode and the rigid motions.
         """
         is_uniform = effort is UNIFORM_EFFORT
         search, block, least = self.search, effort.block, effort.least
@@ -210,9 +209,10 @@ class LowestCurvature:
         return search.lowest(start, block, LONGEST_SEARCH, least // 2)
 
     def _rigid_motions(self, q: Positions) -> Rows | None:
-        """Return translations and rotations (6, n) of a free body at positions q (l, 3) [m].
+        """Return translations and rotations (k, n), k <= 6, of a free body at positions q (l, 3).
 
-        They are orthonormal in M. Return None if nodes or components are fixed.
+        The motions are orthonormal in M; degenerate bodies have fewer than 6. Return None if nodes
+        or components are fixed.
         """
         if self.unknowns.has_fixed:
             return None
@@ -225,7 +225,7 @@ class LowestCurvature:
                 columns[(c + 1) % 3],
             )
         motions = motions.reshape(6, -1)
-        # Orthogonalised twice: the first pass leaves rounding
+        # Orthogonalise twice, because the first pass leaves rounding
         for _ in range(2):
             sizes, parts = np.linalg.eigh(
                 reduced(self.comm, to_host((motions * self.functional.mass) @ motions.T))
@@ -235,7 +235,7 @@ class LowestCurvature:
         return motions
 
     def save(self, checkpoint: Checkpoint) -> None:
-        """Store all that was found, so that a restart needs no long search."""
+        """Store the mode and the searched compression, so that a restart needs no long search."""
         shape = self.functional.lattice.owned, 3
         self.knows_mode = self.mode is not None
         rows: Rows = np.broadcast_to(0.0, shape)

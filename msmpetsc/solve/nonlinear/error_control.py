@@ -1,10 +1,11 @@
 """Stopping rule of a step: the error of an iterate x, and the tolerance of the next linear solve.
 
-The relative error of x is |x - x*|_M / |x - y|_M. It is bounded, then estimated:
+The relative error of x is |x - x*|_M / |x - y|_M. First |x - x*|_M is bounded, then estimated:
 
 1. |F(x)|_(M^-1) is an upper bound if E is convex between x and x*.
 2. The Newton correction at x is the error up to terms of second order (error_estimate). Newton's
-   linear solve finds it on its way. Other methods solve for it once the bound is near the goal.
+   linear solve computes the correction anyway. Other methods solve for the correction once the
+   bound is near the goal.
 
 The next linear solve reduces its residual by the factor
 
@@ -25,14 +26,14 @@ from msmpetsc.solve.nonlinear.curvature import Alarm, Compression, LowestCurvatu
 from msmpetsc.solve.nonlinear.error_estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional
 
-# Relative error below which g, which is quadratic in the error, has no digits left
+# Relative error below which changes of g, quadratic in the error, have no digits [-]
 FULL_STEP_ERROR = 1e-5
-# Ratio of the bound to the error before any estimate was made
+# Assumed ratio of the bound to the error before the first estimate [-]
 FIRST_RATIO = 5.0
-# Ratio of |F| to the last |F| above which F may be rounding of stiff contact
+# Ratio of |F| to the last |F| above which F may be rounding of stiff contact [-]
 STAYS = 0.5
-# Factor on the goal after a doubt. Least goal over the target, and least tolerance of a
-# linear solve over ksp_rtol
+# Factor on the goal after a doubt [-]; least goal [target], which is also the least
+# tolerance of a linear solve [ksp_rtol]
 CLOSER, CLOSEST = 0.1, 1e-3
 # DIVERGED_FNORM_NAN, which PETSc 3.25 renames
 NOT_FINITE = -4
@@ -57,17 +58,17 @@ KSP_REASON = {
 class Outcome:
     """State of a solve at its last iterate.
 
-    goal        : relative error at which the solve ends; 0 if a budget of iterations ends it
+    goal        : relative error at which the solve ends; 0 if a budget of iterations ends the solve
     error       : relative error of the iterate, estimated or bounded
     bound       : upper bound of the relative error, by |F|_(M^-1)
     residual    : |F|_(M^-1) of the iterate
     distance    : |x - y|_M of the iterate
-    reduction   : residual over the residual of the iterate before
+    reduction   : residual over the residual of the last iterate
     corrected   : whether the error was estimated, so that the Newton correction is known
     alarm       : place where a solve has met a negative curvature
     at_rounding : whether F is rounding alone
-    doubts      : number of points found to be no minimum, or farther from it than estimated
-    compression : of the iterate; None if not yet computed
+    doubts      : number of points that were no minimum, or farther from the minimum than estimated
+    compression : compression of the iterate; None if not yet computed
     """
 
     goal: float = 0.0
@@ -97,9 +98,9 @@ class Outcome:
 class ErrorControl:
     """Errors of the iterates of a stepper. All methods that take an iterate are collective.
 
-    target       : relative error at which a step is done; 0 if a budget of iterations ends it
-    rtol         : ksp_rtol, the loosest tolerance of a linear solve
-    ratio        : ratio of bound to error in the last estimate
+    target : relative error at which a step is done; 0 if a budget of iterations ends the step
+    rtol   : ksp_rtol, the loosest tolerance of a linear solve
+    ratio  : ratio of bound to error in the last estimate
     """
 
     functional: StepFunctional
@@ -124,7 +125,7 @@ class ErrorControl:
         )
         reduction = residual / before.residual if np.isfinite(before.residual) else 1.0
         now = replace(now, corrected=False, reduction=reduction, compression=None)
-        # No error is relative to the start x = y
+        # At the start x = y, the distance 0 gives no relative error
         if not distance > 0 or not np.isfinite(residual):
             return replace(now, error=0.0 if at_rounding else np.inf)
         bound = residual / distance
@@ -161,8 +162,8 @@ class ErrorControl:
     def estimated(self, iterate: Iterate, now: Outcome, goal: float) -> Outcome:
         """Return the outcome with an estimated error.
 
-        The error is relative to |x - e - y|_M, e the Newton correction, since x may still be close
-        to y.
+        The error is relative to |x - e - y|_M with the Newton correction e, since x may still be
+        close to y.
         """
         length = self.estimate(iterate, goal * now.distance)
         if not np.isfinite(length):
@@ -172,7 +173,7 @@ class ErrorControl:
     def measured(self, iterate: Iterate, now: Outcome, trust: float = 1.0) -> Outcome:
         """Return the outcome with the error that the last solve for the correction measured.
 
-        trust : lower bound of the correction's norm over the error; 0 if there is none
+        trust : lower bound of the correction's norm over the error; 0 without a bound
         """
         estimate = self.estimate
         length = estimate.correction_norm + estimate.missing
@@ -192,9 +193,9 @@ class ErrorControl:
     def doubt(self, now: Outcome, has_moved: bool) -> Outcome | None:
         """Return the outcome from which a step goes on after a doubt.
 
-        The goal stays if the step has left a saddle. Otherwise it becomes closer: a second
+        If the step has left a saddle, the goal stays. Otherwise the goal becomes smaller: a second
         correction has shown that g is not quadratic, so an error bound of the same size says
-        nothing. Return None if the step has not moved, met no saddle, and its goal is the closest.
+        nothing. Return None if the step has not moved, met no saddle, and has the smallest goal.
 
         has_moved : whether the step goes on from another point
         """
@@ -218,7 +219,7 @@ class ErrorControl:
 def not_converged(
     snes: PETSc.SNES, ksp: PETSc.KSP, now: Outcome, iterations: int, worst: str, true_hessian: bool
 ) -> StepFailed:
-    """Return the failure of a SNES that gave up after ``iterations``.
+    """Return the failure of a SNES that did not converge in ``iterations``.
 
     worst        : description by ``where_worst``
     true_hessian : whether the preset is newton's, so that no other preset can help
@@ -237,7 +238,7 @@ def not_converged(
 
 
 def no_minimum(now: Outcome, worst: str) -> StepFailed:
-    """Return the failure of a step that met too many points that are no minimum."""
+    """Return the failure of a step that found too many points that are no minimum."""
     seen = (
         "a saddle or a fold"
         if np.isinf(now.error)
@@ -252,7 +253,7 @@ def no_minimum(now: Outcome, worst: str) -> StepFailed:
 
 
 def where_worst(functional: StepFunctional, iterate: Iterate) -> str:
-    """Return words on the node of the greatest |F| / m and on inverted cells (collective)."""
+    """Return a text on the node of the greatest |F| / m and on inverted cells (collective)."""
     comm, lattice = functional.comm, functional.lattice
     node = node_of_greatest(comm, lattice, *functional.pull(iterate.f))
     return f", worst at {node}{describe_inverted(comm, lattice, iterate.q)}"

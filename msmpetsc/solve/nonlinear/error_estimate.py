@@ -1,19 +1,19 @@
-"""Error of a step at x by the Newton correction e: H e = F(x), H the true Hessian of g.
+"""Error of a step at x by the Newton correction e: H e = F(x), with H the true Hessian of g.
 
-Terms of second order are left out. Iteration k of CG on H, with the step's preconditioner P, has
+Terms of second order are left out. After k iterations, CG on H with the step's preconditioner P has
 found e_k. The missing part of e is bounded in two ways,
 
     |e - e_k|_M <= |r_k|_(M^-1) / lambda
     |e - e_k|_M <= |r_k|_(P^-1) / sqrt(lambda kappa)
 
 with r_k = F - H e_k, if no eigenvalue of M^(-1) H is below lambda and none of P^(-1) H below kappa.
-The first bound is safe, but too high by up to a thousand on stiff bodies. The second is close, but
-too low if CG has not met the least eigenvalue, since kappa is its least Ritz value. kappa is at
-most 1, the mean of the eigenvalues if P is the diagonal of H. In Newton's own solves the missing
-part counts as the geometric mean of both bounds. With contact, and in a solve for the estimate
-alone, it counts as the first bound.
+The first bound is safe, but too high by up to a thousand on stiff bodies. The second bound is
+close. It is too low if CG has not met the least eigenvalue, since kappa is the least Ritz value of
+CG. kappa is at most 1, the mean of the eigenvalues if P is the diagonal of H. In Newton's own
+solves the missing part counts as the geometric mean of both bounds, if this is below the first
+bound. With contact, and in a solve for the estimate alone, it counts as the first bound.
 
-A solve ends if |e_k|_M and the missing part together are acceptable. Newton's own solves also end
+A solve ends if the sum of |e_k|_M and the missing part is acceptable. Newton's own solves also end
 by the tolerances of KSP. A solve for the estimate alone also ends if
 
 - |e_k|_M is above the acceptable error, or
@@ -36,14 +36,15 @@ from msmpetsc.solve.petsc.events import ESTIMATE
 class ErrorEstimate:
     """Estimate of |x - x*|_M in the steps of one lattice.
 
-    correction : e of the last estimate
-    residual   : F - H e of the last estimate
+    correction      : e_k of the last estimate
+    residual        : F - H e_k of the last estimate
     correction_norm : |e_k|_M of the last estimate [m sqrt(kg)]
-    missing    : bound on the part of e that the last estimate has not found [m sqrt(kg)]
-    lowest     : lower bound of the eigenvalues of M^(-1) H that the last estimate used
-    convexity  : least eigenvalue of M^(-1) H that the step has met, at most 1
-    is_accepted : whether the last solve has shown that the error is acceptable
-    products   : products with H, multigrid's finest level included, of all estimates so far
+    missing         : bound on the part of e that the last estimate has not found [m sqrt(kg)]
+    lowest          : lower bound of the eigenvalues of M^(-1) H that the last estimate used
+    convexity       : least eigenvalue of M^(-1) H that the step has met, at most 1
+    is_accepted     : whether the last solve has shown that the error is acceptable
+    products        : number of products with H in all estimates so far, multigrid's finest level
+                      included
     """
 
     def __init__(
@@ -67,7 +68,7 @@ class ErrorEstimate:
         self.ksp.setOptionsPrefix(f"{prefix}estimate_")
         self.ksp.setType(PETSc.KSP.Type.CG)
         self.ksp.setNormType(PETSc.KSP.NormType.NATURAL)
-        # A PC of its own around the same context: a PC knows its operator
+        # A new PC around the same context, because a PC knows its operator
         pc = self.ksp.getPC()
         pc.setType(PETSc.PC.Type.PYTHON)
         pc.setPythonContext(preconditioner)
@@ -79,7 +80,7 @@ class ErrorEstimate:
 
         The estimate is infinite if the Hessian is not positive definite.
 
-        acceptable : error [m sqrt(kg)]; an estimate above it may be too low
+        acceptable : acceptable error [m sqrt(kg)]; an estimate above this error may be too low
         """
         self.begin(acceptable)
         before = self.hessian.products + self.preconditioner.products
@@ -105,12 +106,12 @@ class ErrorEstimate:
     def begin(self, acceptable: float) -> None:
         """Begin a solve.
 
-        acceptable : error [m sqrt(kg)] of x; 0 if the solve does not tell the error
+        acceptable : acceptable error of x [m sqrt(kg)]; 0 if the solve does not tell the error
         """
         self.lowest, self.is_accepted, self._acceptable = self.convexity, False, acceptable
 
     def test(self, ksp: PETSc.KSP, its: int, residual: float) -> PETSc.KSP.ConvergedReason:
-        """Return whether Newton's solve H e = F ends (the convergence test of its KSP)."""
+        """Return KSP's reason to end Newton's solve H e = F, or to go on (KSPSetConvergenceTest)."""
         reasons, (rtol, atol, divtol, _) = PETSc.KSP.ConvergedReason, ksp.getTolerances()
         if not np.isfinite(residual):
             return reasons.DIVERGED_NANORINF
@@ -127,7 +128,7 @@ class ErrorEstimate:
         return reasons.DIVERGED_DTOL if residual >= divtol * self._first else reasons.ITERATING
 
     def _test_alone(self, ksp: PETSc.KSP, its: int, residual: float) -> PETSc.KSP.ConvergedReason:
-        """Return whether a solve for the estimate alone ends (the convergence test of its KSP)."""
+        """Return KSP's reason to end a solve for the estimate alone, or to go on."""
         reasons = PETSc.KSP.ConvergedReason
         if not np.isfinite(residual):
             return reasons.DIVERGED_NANORINF
@@ -152,17 +153,17 @@ class ErrorEstimate:
         return self.is_accepted
 
     def _meet_eigenvalues(self, ksp: PETSc.KSP) -> None:
-        """Note the least Ritz value of the solve so far; k iterations take O(k^2).
+        """Store the least Ritz value of the solve so far; after k iterations this costs O(k^2).
 
-        Once it is not positive, no eigenvalue bounds the error.
+        Once a Ritz value is not positive, the second bound is not used.
         """
         if self._least > 0:
             self._least = min(self._least, ksp.computeExtremeSingularValues()[1])
 
     def _accepts(self, ksp: PETSc.KSP, natural: float) -> bool:
-        """Measure the correction of a solve so far; return whether the error is acceptable.
+        """Measure the correction of a solve so far. Return whether the error is acceptable.
 
-        natural : |r_k|_(P^-1); infinite for the first bound alone
+        natural : |r_k|_(P^-1); infinite to use the first bound alone
         """
         self.residual = ksp.buildResidual(self.residual)
         self.correction_norm, f = self.functional.norms(ksp.getSolution(), self.residual)

@@ -1,4 +1,4 @@
-"""First guess of a step: the best of several guesses that cost next to nothing."""
+"""First guess of a step: the best of several cheap guesses."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from msmpetsc.solve.nonlinear.functional import StepFunctional
 class FirstGuess:
     """Guesses for the steps of one lattice.
 
-    extrapolate : take the guess of least g; otherwise y, as published
+    extrapolate : whether to take the guess of least g; if not, y as published
     """
 
     def __init__(self, functional: StepFunctional, extrapolate: bool):
@@ -23,8 +23,8 @@ class FirstGuess:
     def best(self) -> Positions:
         """Return the best guess (l, 3) [m] for the step that the functional has begun (collective).
 
-        The guesses are y; y plus the extrapolated elastic corrections of the last steps; q_n moved
-        by the mean displacement of the free flight; and the free flight y + t^2 M^(-1) f_ext. The
+        The guesses are y; y plus the extrapolated elastic corrections of the last steps; the free
+        flight y + t^2 M^(-1) f_ext; and q_n moved by the mean displacement of the free flight. The
         mean displacement keeps the momentum of a free body even if the step stops early.
         """
         problem, lattice = self.functional.problem, self.functional.lattice
@@ -36,19 +36,20 @@ class FirstGuess:
         surface = self.functional.surface
         pressing = surface if surface is not None and surface.presses(q) else None
         guesses = [y]
-        # Its mean would lead through obstacles that press; beyond them g means nothing.
+        # The flight's mean would lead through obstacles that press, and g is not
+        # meaningful beyond them.
         if pressing is None or not pressing.contacts.obstacles.total:
             guesses.append(q + self.drift(flight - q))
         if self.corrections:
             guesses.append(y + 2 * self.corrections[0] - self.corrections[-1])
-        # A free flight would lead into the parts that press each other
+        # A free flight would lead into parts that press on each other
         if pressing is None:
             guesses.append(flight)
         values = [self.functional.value(self.with_fixed(guess)) for guess in guesses]
         return guesses[int(np.argmin(values))]
 
     def learn(self, x: Positions) -> None:
-        """Take the correction of a step that ended at x (l, 3) [m]."""
+        """Store the correction of a step that ended at x (l, 3) [m]."""
         self.corrections = [x - self.functional.problem.y, *self.corrections[:1]]
 
     def forget(self) -> None:

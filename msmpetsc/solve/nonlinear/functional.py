@@ -25,17 +25,17 @@ from msmpetsc.lattice.initial_state import uniform
 from msmpetsc.solve.linear.unknowns import Unknowns, VectorPool
 from msmpetsc.solve.petsc.events import CONTACT, ENERGY, GRADIENT
 
-# Rounding of a row of F, relative to its terms; free fall exceeds one eps now and then
+# Rounding of a row of F [terms of the row]; free fall exceeds one eps now and then
 ROUNDINGS = 3 * np.finfo(float).eps
-# Multiple of the rounding that a single row may have
+# Greatest rounding of a single row [usual rounding]
 SINGLE_ROW = 10.0
-# Displacement by rounding, relative to the body's size, that is of no concern
+# Greatest displacement by rounding that is negligible [body's size]
 NEGLIGIBLE = 1e-6
-# Displacement by a load, relative to the body's greatest coordinate, beyond which no
-# digits of the body's shape are left
+# Displacement by a load beyond which no digits of the body's shape are left [body's
+# greatest coordinate]
 FARTHEST = 1e6
 # Ratio of the displacement by rounding to the displacement by forces beyond which a
-# step is refused
+# step is refused [-]
 HOPELESS = 0.3
 
 
@@ -46,9 +46,10 @@ class StepProblem:
     q          : q_n (l, 3) [m], ghosts included
     y          : positions (l, 3) [m] of the nodes after the step without forces
     load       : f_ext (owned, 3) [N]
-    contact    : penalties that press on the nodes in this step
-    prescribed : q_n with anchored nodes where they are after the step (l, 3) [m]; None if they stay
-    rates      : x^ of a viscous solid, and the positions whose rotation K has, both (l, 3) [m]
+    contact    : contact energy of this step; None without contact
+    prescribed : q_n with anchored nodes at their places after the step (l, 3) [m]; None if anchored
+                 nodes stay
+    rates      : x^ of a viscous solid, and the positions that rotate its K, both (l, 3) [m]
                  (elasticity.viscosity.Viscosity.begin); None if the solid is not viscous
     pressures  : pressures on the lattice's surfaces [Pa]
     system_monitor : called with the first iterate of a solve and its Jacobian; None for no call
@@ -65,18 +66,18 @@ class StepProblem:
 
     @property
     def fixed_positions(self) -> Positions:
-        """Positions (l, 3) [m] whose fixed nodes are at their places after the step."""
+        """Positions (l, 3) [m] with fixed nodes at their places after the step."""
         return self.q if self.prescribed is None else self.prescribed
 
 
 @dataclass(frozen=True)
 class Iterate:
-    """Position of a step with its residual.
+    """Iterate of a step: positions, and the residual and contact at these positions.
 
     x       : unknowns; no method writes to them
     q       : positions (l, 3) [m], ghosts included
     f       : F [kg m]
-    contact : contact at q; None without any
+    contact : contact at q; None without contact
     """
 
     x: PETSc.Vec
@@ -103,7 +104,7 @@ class StepFunctional:
         # Greatest coordinate of the problem's q [m]
         self.extent = 0.0
         self.vectors = VectorPool(unknowns)
-        # Gradients, and products with the Hessian, each used at once
+        # Memory for gradients and for products with the Hessian, which are read at once
         self.scratch = np.empty_like(nodes)
 
     def begin(self, problem: StepProblem) -> None:
@@ -151,7 +152,7 @@ class StepFunctional:
         return self.iterate(x)
 
     def iterate(self, x: PETSc.Vec, q: Positions | None = None) -> Iterate:
-        """Return the iterate of a vector of the pool, which the iterate keeps.
+        """Return the iterate of x, a vector of the pool that the iterate keeps.
 
         q : positions (l, 3) [m] of x if they are known
         """
@@ -162,8 +163,8 @@ class StepFunctional:
     def value(self, q: Positions) -> float:
         """Return g [kg m^2] at positions q (l, 3) [m], up to a constant of the step.
 
-        It compares guesses that are far apart. Self-contact is left out: it costs most and means
-        little if triangles cross.
+        The value is for a comparison of guesses that are far apart. Surface contact is left out: it
+        costs most and means little if triangles cross.
         """
         problem, owned = self.problem, slice(self.lattice.owned)
         moved = q[owned] - problem.y[owned]
@@ -195,13 +196,13 @@ class StepFunctional:
 
     @property
     def surface(self) -> SurfaceContact | None:
-        """Contact of the surface with itself and obstacles in this step; None without any."""
+        """Contact of the surface with itself and obstacles in this step; None without it."""
         return self.problem.contact.surface if self.problem.contact else None
 
     def collision_free_step(
         self, base: Positions, q: Positions, begin: float | None = None
     ) -> float:
-        """Return the collision-free step length, at most 1, on the way from base to q (l, 3) [m].
+        """Return the collision-free step length, at most 1, on the path from base to q (l, 3) [m].
 
         begin : time [s] from which obstacles move to their present places; None if they stay
         """
@@ -219,7 +220,7 @@ class StepFunctional:
         return self.unknowns.projected(like(self.mass, np.stack(noise)))
 
     def _inner(self, a: Rows, b: Rows) -> float:
-        """Return a^T M b of this rank's (owned, 3); 0 in statics."""
+        """Return this rank's part of a^T M b for a and b (owned, 3); 0 in statics."""
         return float(np.vdot(self.unknowns.inertia[:, None] * a, b))
 
     def norm(self, displacement: PETSc.Vec) -> float:
@@ -229,12 +230,12 @@ class StepFunctional:
     def dual_norm(self, f: PETSc.Vec) -> float:
         """Return |f|_(M^-1).
 
-        |F|_(M^-1) bounds |x - x*|_M if E is convex: the Hessian of g is then at least M.
+        |F|_(M^-1) bounds |x - x*|_M if E is convex, because the Hessian of g is then at least M.
         """
         return float(np.sqrt(reduced(self.comm, self._dual_square(f))))
 
     def norms(self, displacement: PETSc.Vec, f: PETSc.Vec) -> tuple[float, float]:
-        """Return |v|_M and |f|_(M^-1) by a single sum over the ranks."""
+        """Return |v|_M and |f|_(M^-1), with a single sum over the ranks."""
         own = np.array([self._square(displacement), self._dual_square(f)])
         of_v, of_f = np.sqrt(reduced(self.comm, own))
         return float(of_v), float(of_f)
@@ -246,12 +247,12 @@ class StepFunctional:
         return float((self.memory.read(f) ** 2 / self.mass).sum())
 
     def pull(self, f: PETSc.Vec) -> tuple[Indices, Floats]:
-        """Return the free nodes, by local number, and |F| / m [m] of each."""
+        """Return the local numbers of the free nodes (m,), and |F| / m [m] of each node (m,)."""
         columns = (self.memory.read(f) / self.mass).reshape(3, -1)
         return self.unknowns.free, np.sqrt((columns**2).sum(axis=0))
 
     def distance(self, q: Positions, correction: PETSc.Vec | None = None) -> float:
-        """Return |q - e - y|_M over the free nodes, to which errors of the step are relative.
+        """Return |q - e - y|_M over the free nodes: errors of the step are relative to this length.
 
         correction : e; None for 0
         """
@@ -264,7 +265,7 @@ class StepFunctional:
 
 
 class Rounding:
-    """Lower bound on errors by rounding, in the steps of one lattice and time step.
+    """Estimate of errors by rounding, in the steps of one lattice and time step.
 
     All methods are collective.
 
@@ -279,12 +280,12 @@ class Rounding:
             self.comm, np.array([3 * float(diagonal.sum()), float(functional.mass.sum())])
         )
         # An error of eps k in the forces moves nodes by at most eps sqrt(sum of t^2 k).
-        # This holds in the norm of a positive definite H, and so in that of M. The
+        # This holds in the norm of a positive definite H, and so in the norm of M. The
         # diagonal is no less than t^2 k.
         self.moved, self.size = float(ROUNDINGS * np.sqrt(stiffness)), float(np.sqrt(mass))
 
     def refuse_loads(self) -> None:
-        """Raise InputError for loads that move a node so far that the shape has no digits left."""
+        """Raise InputError for loads that move a node so far that the shape has no digits."""
         functional = self.functional
         load = np.sqrt((functional.problem.load[functional.unknowns.free] ** 2).sum(axis=1))
         local = np.array([greatest(load), functional.t2 * greatest(load / self.diagonal)])
@@ -301,7 +302,7 @@ class Rounding:
 
         Rows are tested one by one, since soft parts have less rounding than stiff parts.
 
-        with_contact : whether the stiffness of contact counts; without it the test costs less
+        with_contact : whether the stiffness of contact counts; without it the test is cheaper
         """
         functional, known = self.functional, self.rows
         if with_contact and iterate.contact:
@@ -315,20 +316,23 @@ class Rounding:
 
     @property
     def displacement(self) -> float:
-        """Greatest displacement by rounding, in the norm of M."""
+        """Greatest displacement by rounding, in the norm of M [m sqrt(kg)]."""
         return self.moved * self.functional.extent
 
     def relative(self, length: float, distance: float) -> float:
-        """Return |e|_M / |x - y|_M, whose denominator is at least the displacement by rounding."""
+        """Return length / distance, with a distance at least the displacement by rounding.
+
+        length, distance : |e|_M of an error and |x - y|_M [m sqrt(kg)]
+        """
         return length / max(distance, self.displacement, sys.float_info.min)
 
     def step_error(self, error: float, away: float, is_rounding: bool = False) -> float:
-        """Return the relative error of a step, at least the error by rounding.
+        """Return the relative error of a step: ``error``, or the error by rounding if greater.
 
         If rounding alone moves the body, the error is relative to the body's size.
 
-        away        : |x - y|_M of the step
-        is_rounding : whether F is rounding alone, which then made the error
+        away        : |x - y|_M of the step [m sqrt(kg)]
+        is_rounding : whether F is rounding alone, so that the error comes from rounding
 
         Raises StepFailed if rounding moves the body about as far as its forces do.
         """

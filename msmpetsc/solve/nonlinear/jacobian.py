@@ -35,11 +35,11 @@ class Jacobian:
     """True Hessian of g, or the constant A = M + t^2 L in its place (paper Eq. 15-17).
 
     touches  : whether steps may have a ``contact``
-    owned    : takes the objects to destroy, in the order of their creation
+    owned    : stack of objects to destroy, in the order of their creation
     diagonal : (m,) inertia plus t^2 times the stiffness at rest of this rank's free nodes [kg]
 
-    Raises InputError if A is too large for PETSc, or if its type does not go with the arrays. It
-    also does so if the options ask for multigrid of A (collective).
+    Raises InputError if A is too large for PETSc, if its type is for another device, or if options
+    ask for multigrid of A (collective).
     """
 
     functional: StepFunctional
@@ -63,7 +63,7 @@ class Jacobian:
             self._contact_blocks(),
             functional.scratch,
         )
-        # Contact's blocks beside A
+        # Blocks of contact to add to products with A
         self.blocks = None if true_hessian else self._contact_blocks()
         kind = options.value("pc_type")
         if kind == MULTIGRID and not true_hessian:
@@ -82,7 +82,7 @@ class Jacobian:
         )
 
     def _is_stiff(self) -> bool:
-        """Return whether multigrid takes less time than Jacobi's, and rounding keeps the mass."""
+        """Return whether multigrid is faster than Jacobi's preconditioner and rounding keeps M."""
         unknowns, mass = self.unknowns, self.unknowns.lattice.mass[self.unknowns.free]
         inertia = unknowns.inertia[unknowns.free]
         ratio = self.comm.allreduce(greatest((self.diagonal - inertia) / mass), MPI.MAX)
@@ -135,10 +135,10 @@ class Jacobian:
         projected: bool,
         duals: Duals | None,
     ) -> None:
-        """Linearise H at positions q (l, 3) [m], and contact; A is constant (collective).
+        """Linearise H and contact at positions q (l, 3) [m]; A is constant (collective).
 
         projected : leave out the negative parts of H
-        duals     : of friction; None for its true curvature
+        duals     : duals of friction; None for its true curvature
         """
         if self.preset.true_hessian:
             self.hessian.linearise(q, contact, projected, duals)
@@ -150,13 +150,12 @@ class Jacobian:
 
 
 class FrictionDuals:
-    """Dual unknowns of Newton's method: forces of friction over their limits.
+    """Dual unknowns of Newton's method: friction forces over their limits (contact.friction).
 
-    See contact.friction.
-
-    contact : of the step in progress; None without any
-    duals   : of the next Hessian; None without contact. A step begins with zeros, the secants, for
-              nodes on obstacles, and with None, their own forces, for pairs of surfaces
+    contact : contact of the step in progress; None without contact
+    duals   : duals for the next Hessian; None without contact. At the start of a step, nodes on
+              obstacles have zeros, which give the secants. Pairs of surfaces have None, which
+              gives their own forces
     """
 
     def __init__(self) -> None:
@@ -171,7 +170,7 @@ class FrictionDuals:
     def update(self, q: Positions, base: Positions, is_full: bool) -> None:
         """Update the duals after a step from base to q (l, 3) [m].
 
-        is_full : whether it is the full step; a shorter step resets the duals
+        is_full : whether the step is the full Newton step; a shorter step resets the duals
         """
         if self.contact is None or self.duals is None:
             return

@@ -1,7 +1,8 @@
 """Lowest eigenvalues of M^(-1) H by locally optimal conjugate gradients (LOBPCG).
 
 The method is Algorithm 5.1 of Knyazev 2001, Toward the optimal preconditioned eigensolver, with the
-step's preconditioner. A block is needed since a single direction may settle on a higher mode.
+step's preconditioner. A block of directions is needed, since a single direction may converge to a
+higher mode.
 """
 
 from collections.abc import Callable, Iterator
@@ -18,16 +19,16 @@ from msmpetsc.solve.linear.operators import TrueHessian
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 
-# Most iterations of a long search
+# Greatest number of iterations of a long search
 LONGEST_SEARCH = 100
-# A long search ends if the lowest eigenvalue is above this share of its value half as
-# many iterations ago; if it is negative, above the inverse of this share
+# Ratio of the lowest eigenvalue to its value at half as many iterations, above which a
+# long search ends [-]; its inverse for negative eigenvalues
 SETTLED = 0.95
 TINY = np.finfo(float).tiny
-# Relative eigenvalue of a Gram matrix below which directions are linearly dependent
+# Relative eigenvalue of a Gram matrix below which directions are linearly dependent [-]
 DEPENDENT = 1e-10
 
-# Unknowns that a combination of directions takes at a time; bounds its copies
+# Number of unknowns in a chunk of directions; bounds the memory of combinations
 CHUNK = 1 << 16
 
 Act = Callable[[None, PETSc.Vec, PETSc.Vec], None]
@@ -36,9 +37,9 @@ Act = Callable[[None, PETSc.Vec, PETSc.Vec], None]
 class SearchEffort(NamedTuple):
     """Effort of searches.
 
-    block    : directions of a long search
-    least    : fewest iterations of a long search
-    followed : iterations of a short search, which has two directions
+    block    : number of directions of a long search
+    least    : least number of iterations of a long search
+    followed : number of iterations of a short search, which has two directions
     """
 
     block: int
@@ -47,17 +48,17 @@ class SearchEffort(NamedTuple):
 
 
 EFFORT = SearchEffort(4, 12, 2)
-# With multigrid smooth modes converge at once. After an alarm EFFORT is taken all the
-# same: a folded body may hide its lowest mode.
+# Effort with multigrid, with which smooth modes converge at once. After an alarm EFFORT
+# is still taken, because a folded body may hide its lowest mode.
 UNIFORM_EFFORT = SearchEffort(2, 3, 1)
 
 
 @dataclass
 class SearchSpace:
-    """Directions of a search and their products, which iterations change in place.
+    """Directions of a search and their products with H, which iterations change in place.
 
-    directions : (room, n), of which the first ``used`` count
-    products   : (room, n) with H
+    directions : (room, n), the first ``used`` rows are in use
+    products   : (room, n) products of the directions with H
     """
 
     directions: Rows
@@ -65,12 +66,12 @@ class SearchSpace:
     used: int
 
     def _chunks(self) -> Iterator[slice]:
-        """Yield the unknowns in chunks."""
+        """Return an iterator over the unknowns in chunks."""
         count = self.directions.shape[1]
         return (slice(at, at + CHUNK) for at in range(0, count, CHUNK))
 
     def grams(self, mass: Floats) -> Rows:
-        """Return the Gram matrices (2, used, used) of the directions in H and M, of this rank."""
+        """Return this rank's part of the directions' Gram matrices in H and M (2, used, used)."""
         sums = np.zeros((2, self.used, self.used))
         rows = slice(self.used)
         for chunk in self._chunks():
@@ -80,7 +81,7 @@ class SearchSpace:
         return sums
 
     def combine(self, parts: Rows) -> None:
-        """Replace the directions by k combinations of them, of coefficients (k, used)."""
+        """Replace the directions by combinations of them, with coefficients ``parts`` (k, used)."""
         count, on_device = len(parts), like(self.directions, parts)
         for rows in (self.directions, self.products):
             for chunk in self._chunks():
@@ -91,7 +92,7 @@ class SearchSpace:
 class Lobpcg:
     """Search for the lowest eigenvalues of M^(-1) H. All methods are collective.
 
-    its : new directions of all searches so far; an iteration has one for each mode
+    its : number of new directions in all searches so far; an iteration adds one for each mode
     """
 
     def __init__(
@@ -117,8 +118,9 @@ class Lobpcg:
         """Return the lowest eigenvalues (k,), k <= block, of M^(-1) H and their modes (k, n).
 
         start    : directions (l, n) in parts, which the search takes out of the list
-        most     : most iterations
-        least    : fewest iterations
+        block    : number of modes to search
+        most     : greatest number of iterations
+        least    : least number of iterations
         left_out : directions (r, n), orthonormal in M, that the search leaves out
         """
         lowest = []
@@ -137,8 +139,8 @@ class Lobpcg:
         """Yield the lowest eigenvalues (k,), their modes (k, n) and errors (k,), without end.
 
         The errors r^T P^-1 r, with residuals r and the preconditioner P, belong to the eigenvalues
-        before the last iteration. The next iteration overwrites the modes. Arguments
-        are those of ``lowest``.
+        before the last iteration. The next iteration overwrites the modes. The arguments are
+        described in ``lowest``.
         """
         space = self._space(start, block)
         values = self._ritz(space, min(block, space.used))
@@ -170,7 +172,7 @@ class Lobpcg:
         return space
 
     def _multiply(self, space: SearchSpace, first: int) -> None:
-        """Compute the products with the directions from the ``first`` on."""
+        """Compute the products of H with the directions from the number ``first`` on."""
         new = slice(first, space.used)
         self._of_each(self.hessian.mult, space.directions[new], space.products[new])
 
@@ -189,8 +191,8 @@ class Lobpcg:
     def _ritz(self, space: SearchSpace, size: int) -> Floats:
         """Return the lowest Ritz values (size,) in a space, ascending, and reduce the space.
 
-        The space then has the Ritz vectors, of unit length. After them come the conjugate
-        directions: the parts of the Ritz vectors outside the first ``size`` directions.
+        The reduced space has the Ritz vectors, of unit length, then the conjugate directions. These
+        are the parts of the Ritz vectors outside the first ``size`` directions.
         """
         grams = reduced(self.comm, space.grams(self.functional.mass))
         lengths = np.sqrt(np.maximum(grams[1].diagonal(), TINY))
@@ -213,7 +215,10 @@ class Lobpcg:
         return directions - like(directions, parts) @ left_out
 
     def _of_each(self, act: Act, directions: Rows, results: Rows) -> None:
-        """Write the results (k, n) of an operator on directions (k, n); they may be the same."""
+        """Write an operator's products with ``directions`` (k, n) to ``results`` (k, n).
+
+        Both may be the same array.
+        """
         vectors = self.functional.vectors
         source, product = vectors.take(), vectors.take()
         for direction, result in zip(directions, results, strict=True):

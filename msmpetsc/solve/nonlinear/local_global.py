@@ -1,4 +1,4 @@
-"""Methods with the constant matrix A = M + t^2 L for the Jacobian, by any of PETSc's SNES.
+"""Methods with the constant matrix A = M + t^2 L as the Jacobian, by any of PETSc's SNES.
 
 With A, Newton's method is the paper's local/global iteration x <- x - A^(-1) F(x) (Eq. 17). SNES
 accelerates it (anderson, ngmres), searches along it, or begins L-BFGS with A.
@@ -19,12 +19,12 @@ from msmpetsc.solve.refused_options import BY_ERROR
 
 @dataclass(eq=False)
 class LocalGlobal(StepMethod):
-    """A SNES with A for its Jacobian. All methods are collective.
+    """A SNES with A as its Jacobian. All methods are collective.
 
-    prefix  : of the options
+    prefix  : prefix of the options
     has_npc : whether a plain iteration preconditions SNES
     base    : positions (l, 3) [m] to which changes of g are relative
-    outcome : of SNES's last iterate
+    outcome : outcome of SNES's last iterate
     """
 
     prefix: str
@@ -44,18 +44,18 @@ class LocalGlobal(StepMethod):
             self.ksp.setInitialGuessNonzero(True)
 
     def begin(self) -> None:
-        """Begin a step; nothing is kept from the last step."""
+        """Begin a step; this method keeps no data of steps."""
 
     def minimise(self, start: Iterate, outcome: Outcome) -> tuple[Iterate, Outcome]:
         self.base, self.outcome = start.q, replace(outcome, residual=np.inf)
         if self.has_npc:
-            # The NPC solves with A before SNES tests its start
+            # The nonlinear preconditioner solves with A before SNES tests the start
             self.outcome = self._judge(start)
             if self.outcome.is_converged:
                 return start, self.outcome
             self.adapt(self.outcome)
         if self.snes.getType() == PETSc.SNES.Type.QN:
-            # QN keeps the secants of the last solve; a new type has none
+            # QN keeps the secants of the last solve; setting the type again drops them
             self.snes.setType(PETSc.SNES.Type.KSPONLY)
             self.snes.setType(PETSc.SNES.Type.QN)
             self.snes.setFromOptions()
@@ -72,7 +72,7 @@ class LocalGlobal(StepMethod):
         return iterate, self.outcome
 
     def _judge(self, iterate: Iterate) -> Outcome:
-        """Return the outcome at SNES's next iterate, its error estimated near the goal."""
+        """Return the outcome at SNES's next iterate, with an estimated error near the goal."""
         return self.control.estimated_if_near(iterate, self.control.judge(iterate, self.outcome))
 
     def _residual(self, _: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
@@ -105,7 +105,7 @@ class LocalGlobal(StepMethod):
         """Return PETSc's reason to end, or 0 to go on (SNESConvergenceTest)."""
         if its > 0 or not self.has_npc:
             x = snes.getSolution()
-            # With an NPC, ``f`` belongs to another x
+            # With a nonlinear preconditioner, ``f`` belongs to another x
             q = self.functional.positions(x)
             if self.has_npc:
                 iterate = self.functional.evaluate(x, self.own, q)

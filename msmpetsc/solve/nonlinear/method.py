@@ -1,4 +1,4 @@
-"""Base of the methods that minimise g in a step."""
+"""Base class of the methods that minimise g in a step."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -21,17 +21,17 @@ from msmpetsc.solve.nonlinear.jacobian import Jacobian
 from msmpetsc.solve.presets import MOST_ITERATIONS, Preset, SolverOptions
 from msmpetsc.solve.work import Work
 
-# Cost of an iteration of a method without its linear solve [iterations of CG]
+# Cost of an iteration without its linear solve [iterations of CG]
 ITERATION = 10
 REASON = PETSc.SNES.ConvergedReason
 
 
 @dataclass(eq=False)
 class StepMethod(ABC):
-    """Method that reduces the residual F to the goal of an outcome. All methods are collective.
+    """Method that minimises g to the goal of an outcome. All methods are collective.
 
-    snes, ksp : with the user's options
-    budget    : iterations after which the method ends; 0 for no budget
+    snes, ksp : solvers with the user's options
+    budget    : number of iterations after which the method ends; 0 for no budget
     spent     : returns the work of the step in progress so far
     """
 
@@ -51,7 +51,7 @@ class StepMethod(ABC):
 
     @abstractmethod
     def minimise(self, start: Iterate, outcome: Outcome) -> tuple[Iterate, Outcome]:
-        """Return an iterate at the goal of an outcome, and its outcome.
+        """Return an iterate that meets the goal of ``outcome``, and the iterate's outcome.
 
         Raises StepFailed, StepStopped and InputError.
         """
@@ -78,14 +78,14 @@ class StepMethod(ABC):
         return int(REASON.ITERATING)
 
     def adapt(self, outcome: Outcome) -> None:
-        """Set the tolerance of the next linear solve, if the user does not."""
+        """Set the tolerance of the next linear solve, unless the user has fixed it."""
         if self.preset.iterations is None and self.options.is_default("ksp_rtol"):
             self.ksp.setTolerances(rtol=self.control.tolerance(outcome))
 
     def finish(self, iterate: Iterate, outcome: Outcome) -> Outcome:
-        """Return the final outcome, its error estimated if SNES converged without an estimate.
+        """Return the final outcome, with an estimated error if SNES converged without an estimate.
 
-        Raises StepStopped and StepFailed if SNES did not converge.
+        If SNES did not converge, raises StepStopped after a signal, and StepFailed otherwise.
         """
         reason = self.snes.reason
         if reason > 0 and not (outcome.corrected or outcome.error <= outcome.goal):

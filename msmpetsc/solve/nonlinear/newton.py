@@ -1,14 +1,14 @@
 """Newton's method for a step, with the true Hessian H of g, CG, and a line search on g:
 
     H(x_k) y = F(x_k)                by CG, to the digits that the step still lacks
-    y <- y bent at obstacles, and the part of it on which the surface crosses nothing
+    y <- y, bent at obstacles and shortened so that the surface crosses nothing
     x_(k+1) = x_k - s y              g(x_(k+1)) <= g(x_k) - ALPHA s y . F(x_k)     (Armijo)
 
 until the error of x_k is below the goal (error_control). Under compression H may be indefinite. CG
 then stops with the descent direction found so far. If CG's first direction has a negative
 curvature, no s lowers g. Then the projected Hessian, without negative parts, takes over for some
 iterations. It also takes over if CG stopped at an indefinite H and the surface would cross
-something almost at once along y: such a y closes gaps whose stiffness CG has not met yet.
+something almost at once along y: this y closes gaps whose stiffness CG has not met yet.
 """
 
 from dataclasses import dataclass, replace
@@ -27,19 +27,19 @@ from msmpetsc.solve.nonlinear.jacobian import FrictionDuals
 from msmpetsc.solve.nonlinear.method import REASON, StepMethod
 from msmpetsc.solve.petsc.events import LOCAL
 
-# Iterations with the projected Hessian, which converges slowly, before the true Hessian
-# is tried
+# Number of iterations with the projected Hessian, which converges slowly, before the
+# true Hessian is tried
 PROJECTED = 5
-# Growth of |F| in the first iteration of a static state beyond which softer solids come
-# first; and ratio of lambda from such a solid to the next
+# Growth of |F| in the first iteration of a static state beyond which softer solids are
+# solved first [-]; also the ratio of lambda from a softer solid to the next
 SOFTER = 9.0
-# Share of the slope by which a step must lower g (Armijo)
+# Share of the slope by which a step must lower g [-] (Armijo)
 ALPHA = 1e-4
-# Least and greatest share of a step length that the line search tries next
+# Least and greatest ratio of the next step length to the last in a line search [-]
 LEAST, MOST = 0.1, 0.5
-# Least step length; along a rising direction g may seem to fall by rounding
+# Least step length [-]; along a rising direction g may seem to fall by rounding
 SHORTEST = 1e-6
-# Share of its slope that a direction must keep when it is bent at obstacles
+# Share of the slope that a direction must keep if bent at obstacles [-]
 DOWNHILL = 0.1
 # Collision-free step length [-] along a direction of an indefinite H, below which the
 # projected Hessian takes over
@@ -96,7 +96,7 @@ class Newton(StepMethod):
         return is_cg and is_natural and not any(map(self.options.is_given, TESTS))
 
     def minimise(self, start: Iterate, outcome: Outcome) -> tuple[Iterate, Outcome]:
-        """Return the iterate that the loop ends at, and its outcome (StepMethod.minimise)."""
+        """Return the iterate at which the loop ends, and its outcome (StepMethod.minimise)."""
         self._given = start, outcome
         self.snes.solve(None, self.end)
         iterate, outcome = self._given
@@ -139,7 +139,7 @@ class Newton(StepMethod):
         snes.setConvergedReason(reason)
 
     def _reason(self, snes: PETSc.SNES, its: int, now: Iterate, outcome: Outcome) -> int:
-        """Monitor an iterate and return PETSc's reason to end there; 0 to go on."""
+        """Monitor an iterate, and return PETSc's reason to end at it; 0 to go on."""
         snes.setIterationNumber(its)
         snes.monitor(its, now.f.norm())
         if its == 0:
@@ -155,21 +155,21 @@ class Newton(StepMethod):
         )
 
     def _judge(self, iterate: Iterate, before: Outcome, projected: int) -> Outcome:
-        """Return the outcome at an iterate, with its error if the linear solve will not tell it."""
+        """Return the outcome at an iterate; estimate the error if the linear solve will not."""
         outcome = self.control.judge(iterate, before)
         if self._can_tell_error(projected):
             return outcome
         return self.control.estimated_if_near(iterate, outcome)
 
     def _can_tell_error(self, projected: int) -> bool:
-        """Return whether the next linear solve is of the true elastic Hessian, with the test."""
+        """Return whether the next linear solve has the true elastic Hessian and the error test."""
         return self.is_tested and not projected and self.slopes is None
 
     def _tells_error(self, now: Iterate, outcome: Outcome, projected: int) -> bool:
         """Return whether the next linear solve tests the error of x.
 
-        With contact it does so only near the goal. Farther away, duals replace the true curvature
-        of friction.
+        With contact the solve tests the error only near the goal. Farther away, duals replace the
+        true curvature of friction.
         """
         is_near = now.contact is None or self.control.is_near(outcome)
         return is_near and self._can_tell_error(projected)
@@ -177,8 +177,8 @@ class Newton(StepMethod):
     def _linearise(self, now: Iterate, is_true: bool, projected: bool) -> None:
         """Linearise F at an iterate.
 
-        is_true   : use the true curvature of friction, not its duals
-        projected : use H without its negative parts
+        is_true   : whether friction has its true curvature, not its duals
+        projected : whether H is taken without its negative parts
         """
         with LOCAL:
             duals = None if is_true else self.friction.duals
@@ -210,11 +210,10 @@ class Newton(StepMethod):
     def _trust(self, now: Iterate, outcome: Outcome) -> float:
         """Return a lower bound of |y|_M over the error; 0 if y does not bound the error.
 
-        Contact has kinks that no H predicts: there |y|_M counts as the error.
-
-        If H misses a part theta |F(x)| of F(x - y), Newton's corrections shrink by about theta.
-        The error is then at most |y|_M / (1 - theta) (Deuflhard 2011, Newton Methods for Nonlinear
-        Problems, Sect. 2.1).
+        Let H miss a part of size theta |F(x)| of F(x - y). Then Newton's corrections shrink by
+        about theta, and the error is at most |y|_M / (1 - theta) (Deuflhard 2011, Newton Methods
+        for Nonlinear Problems, Sect. 2.1). Contact has kinks that no H predicts. With contact,
+        |y|_M counts as the error.
         """
         if now.contact:
             return 1.0
@@ -228,9 +227,10 @@ class Newton(StepMethod):
         return max(1 - theta, 0.0)
 
     def _search(self, now: Iterate, flat: bool) -> Iterate | None:
-        """Return the first iterate x - s y of sufficient descent; None if g falls for no s.
+        """Return the first iterate x - s y with sufficient descent; None if no s lowers g.
 
-        flat : g is so close to its minimum that its change has no digits; take the full step
+        flat : whether g is so close to its minimum that its change has no digits; then take the
+               full step
         """
         slope, s, x = -abs(self.y.dot(now.f)), 1.0, self.functional.vectors.take()
         longer = None
@@ -247,7 +247,7 @@ class Newton(StepMethod):
         return None
 
     def _limit(self, now: Iterate) -> float:
-        """Bend y at obstacles, then shorten it until the surface crosses nothing on it.
+        """Bend y at obstacles, then shorten y so that the surface crosses nothing.
 
         Return the collision-free step length along the bent y.
         """
@@ -265,12 +265,12 @@ class Newton(StepMethod):
         """Bend y so that nodes stop at obstacles that they would enter.
 
         H at x lacks obstacles that nodes do not touch yet. If the line search shortened the whole
-        step for such nodes, they would come into contact one by one. A direction that hardly
-        descends when bent stays as it is.
+        step for these nodes, they would come into contact one by one. If the bent direction hardly
+        descends, y stays as it is.
 
         end : positions (l, 3) [m] at x - y
 
-        Return the new end (l, 3) [m].
+        Return the positions (l, 3) [m] at the end of the new y.
         """
         functional, bent = self.functional, self.end
         stopped = contact.stopped(end)
@@ -289,14 +289,14 @@ class Newton(StepMethod):
 def shorter(slope: float, tried: tuple[float, float], longer: tuple[float, float] | None) -> float:
     """Return the next step length of a line search.
 
-    The length minimises the cubic through the slope at 0 and the last two changes of g. After the
-    first trial it minimises the parabola. It is between LEAST and MOST times the last length
-    (Dennis and Schnabel 1996, Numerical Methods for Unconstrained Optimization, A6.3.1). If the
-    last change is not finite, it is LEAST times the last length.
+    The length minimises the cubic through the slope at 0 and the last two changes of g; after the
+    first trial, the parabola. It is between LEAST and MOST times the last length (Dennis and
+    Schnabel 1996, Numerical Methods for Unconstrained Optimization, A6.3.1). If the last change is
+    not finite, the length is LEAST times the last length.
 
     slope  : derivative of g by the step length at 0
     tried  : last step length and change of g there
-    longer : step length before and change of g there; None after the first trial
+    longer : step length before the last and change of g there; None after the first trial
     """
     s, change = tried
     if not np.isfinite(change):

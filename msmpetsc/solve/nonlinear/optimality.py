@@ -1,8 +1,9 @@
-"""Test whether an iterate is a minimum of g, and whether its error was estimated rightly.
+"""Test whether an iterate is a minimum of g, and whether the estimate of its error is right.
 
-F may be small without a minimum. The estimate of a step's error is the Newton correction e at x.
-If the body is compressed, g may have a fold or a saddle between x and x - e. Its curvature may also
-change so much that e says little. So Hessian and error are examined once more at x - e.
+F may be small at a point that is no minimum. The estimate of a step's error is the Newton
+correction e at x. If the body is compressed, g may have a fold or a saddle between x and x - e. The
+curvature of g may also change so much that e says little. So Hessian and error are examined once
+more at x - e.
 """
 
 from dataclasses import dataclass, replace
@@ -19,17 +20,17 @@ from msmpetsc.solve.nonlinear.error_estimate import ErrorEstimate
 from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctional
 
 # Least eigenvalue of M^(-1) H below which the first estimate may have missed too much
+# [-]
 CONVEX = 0.5
-# Share of the first correction; a second correction above it shows that g is not
-# quadratic
+# Ratio of the second correction to the first above which g is not quadratic [-]
 SMALL = 0.3
-# Factor on an error that both corrections disagree on
+# Factor on the error if the two corrections disagree [-]
 DOUBTFUL = 30.0
-# Ratio of the slope of g to the change of slope over the first move; a smaller slope
-# may be rounding
+# Ratio of the slope of g to the change of slope over the first move, below which the
+# slope may be rounding [-]
 SLOPE = 0.25
 # First move off a saddle [cells], doubled while g falls or halved until g falls; and
-# most moves
+# greatest number of moves
 FIRST_MOVE, MOVES = 1e-3, 24
 
 
@@ -37,10 +38,10 @@ FIRST_MOVE, MOVES = 1e-3, 24
 class Verdict:
     """Verdict on an iterate.
 
-    error      : relative error of the iterate; infinite if no estimate can be had
+    error      : relative error of the iterate; infinite if no estimate is possible
     examined   : point at which g was examined, x or x - e
-    direction  : (n,) of negative curvature; None if there is none
-    curvature  : along the direction, an eigenvalue of M^(-1) H
+    direction  : (n,) direction of negative curvature; None if there is none
+    curvature  : curvature along the direction, an eigenvalue of M^(-1) H
     is_minimum : whether the step may end at the iterate
     """
 
@@ -72,8 +73,8 @@ class Optimality:
     def examine(self, at: Iterate, outcome: Outcome, acceptable: float) -> Verdict:
         """Examine g at x - e, or at x if the iterate has no correction e; return the verdict.
 
-        outcome    : of the iterate, with its compression; ``corrected`` if estimate.correction
-                     is e
+        outcome    : outcome of the iterate, with its compression; ``corrected`` if e is known, as
+                     estimate.correction
         acceptable : acceptable error |e|_M [m sqrt(kg)]
         """
         functional, estimate, compression = self.functional, self.estimate, outcome.compression
@@ -95,13 +96,13 @@ class Optimality:
         value = min(value, 1.0)
         estimate.convexity = min(estimate.convexity, value)
         rest = functional.dual_norm(examined.f) / value
-        # An upper bound if g is as convex on the way to the minimum
+        # An upper bound if g is as convex on the path to the minimum
         if value > CONVEX and length + rest <= acceptable:
             return Verdict(
                 self.rounding.relative(length + rest, functional.distance(examined.q)), examined
             )
         if corrected and value <= CONVEX < estimate.lowest:
-            # The estimate took the missing part of the error for too small
+            # The estimate took the missing part of the error to be too small
             again = bool(np.isfinite(estimate(at)))
             return self.examine(at, replace(outcome, corrected=again), acceptable)
         estimated = estimate.correction_norm + estimate.missing
@@ -134,9 +135,9 @@ class Optimality:
     ) -> float:
         """Return the relative error of the iterate by two corrections, the first of norm ``first``.
 
-        If the surface meets itself along the second correction, g is not quadratic along it, and
+        If the surface crosses something along the second correction, g is not quadratic there, and
         the error may be far larger. If F is rounding alone, CG may break down. Then ``bound``
-        replaces the second correction, or the error is infinite if ``lowest`` is at most CONVEX.
+        replaces the second correction, but if ``lowest`` is at most CONVEX, the error is infinite.
         """
         functional, estimate, relative = self.functional, self.estimate, self.rounding.relative
         distance = functional.distance(examined.q)
@@ -153,9 +154,10 @@ class Optimality:
         return relative(first + second, distance)
 
     def lower_iterate(self, at: Iterate, verdict: Verdict) -> Iterate | None:
-        """Return an iterate of lower g than an iterate that is no minimum, or None.
+        """Return an iterate of lower g than an iterate that is no minimum; None if none is found.
 
-        It is the point examined, or a point farther along a direction of negative curvature.
+        The result is the point examined, or a point farther along a direction of negative
+        curvature.
         """
         falls = self.functional.change(verdict.examined.q, at.q)[0] < 0
         lower = verdict.examined if falls else None
@@ -166,14 +168,14 @@ class Optimality:
     def _descend(self, at: Iterate, direction: Floats, curvature: float) -> Iterate | None:
         """Return an iterate of lower g along a direction (n,) of negative curvature.
 
-        Return None if g rises.
+        Return None if no move lowers g.
         """
         functional, base = self.functional, at.q
         slope = reduced(functional.comm, float(self.memory.read(at.f) @ direction))
         longest = float(reduced(functional.comm, greatest(np.abs(direction)), MPI.MAX))
         move = FIRST_MOVE * functional.lattice.cell_size / longest
-        # A smaller slope may be rounding: then g falls in both directions, and all
-        # ranks take the same
+        # A smaller slope may be rounding. Then g falls in both directions, and all
+        # ranks take the same direction.
         if slope > SLOPE * abs(curvature) * move:
             move = -move
         x, best, lowest = functional.vectors.take(), 0.0, 0.0

@@ -1,9 +1,9 @@
 """Preconditioners of a step's linear solves: any PC of A, or multigrid of the Hessian.
 
 With Jacobi's preconditioner CG takes about sqrt(kappa) / 2 ln(2 / rtol) iterations. In free space
-kappa = 2 (1 + t^2 k / m), k the stiffness of the springs at a node. Multigrid takes about four
-iterations for any kappa, each of which costs several times as much. So short steps use Jacobi's
-preconditioner, and longer steps use multigrid.
+kappa = 2 (1 + t^2 k / m), with k the stiffness of the springs at a node. Multigrid takes about four
+iterations for any kappa, but each iteration costs several times as much. So short steps use
+Jacobi's preconditioner, and longer steps use multigrid.
 """
 
 import numpy as np
@@ -24,16 +24,18 @@ from msmpetsc.solve.petsc.events import CYCLE, GRIDS, HIERARCHY
 
 MULTIGRID = PETSc.PC.Type.MG
 DIRECT = {PETSc.PC.Type.CHOLESKY, PETSc.PC.Type.LU}
-# Greatest t^2 k / m of a node; beyond it multigrid takes less time than Jacobi's
+# Greatest t^2 k / m of a node [-] above which multigrid is faster than Jacobi's
+# preconditioner
 STIFF = 15.0
-# t^2 k / m beyond which rounding hides M in H; only M resists translations of a free
-# body
+# Greatest t^2 k / m of a node [-] from which rounding hides M in H; only M resists
+# translations of a free body
 MASSLESS = 1e9
-# Iterations per digit with a hierarchy of the present positions
+# Number of iterations per digit with a hierarchy of the present positions
 USUAL_RATE = 2.5
-# Iterations that cost as much as a new hierarchy
+# Number of iterations that cost as much as a new hierarchy
 WORTH = 10.0
-# Iterations beyond the usual number that a solve with an old hierarchy may take
+# Number of iterations beyond the usual number that a solve with an old hierarchy may
+# take
 PATIENCE = 15.0
 
 
@@ -52,7 +54,7 @@ class StepPreconditioner:
 
     @property
     def products(self) -> int:
-        """Products with the Hessian so far."""
+        """Number of products with the Hessian so far."""
         return 0
 
     def prepare(self, q: Positions, contact: StepContactAt | None) -> bool:
@@ -60,17 +62,20 @@ class StepPreconditioner:
         raise NotImplementedError
 
     def most_iterations(self, rtol: float) -> int | None:
-        """Return the most iterations of a solve to a tolerance; None for PETSc's option."""
+        """Return the greatest number of iterations of a solve; None for PETSc's option.
+
+        rtol : relative tolerance of the solve
+        """
         return None
 
     def learn(self, its: int, rtol: float) -> None:
         """Count the iterations of a linear solve to a relative tolerance."""
 
     def forget(self) -> None:
-        """Forget earlier steps."""
+        """Forget data of earlier steps."""
 
     def setFromOptions(self, _: PETSc.PC) -> None:
-        """Take the options -pc_... (PCSetFromOptions calls it)."""
+        """Read the options -pc_... (PCSetFromOptions calls it)."""
 
     def setUp(self, _: PETSc.PC) -> None:
         """Set up the preconditioner (PCSetUp calls it)."""
@@ -97,14 +102,14 @@ class StepPreconditioner:
 class MatrixPreconditioner(StepPreconditioner):
     """Any PETSc preconditioner of A, applied to the three columns of coordinates.
 
-    The options -pc_... set it for every preset, since A also preconditions the true Hessian. A
-    bound on contact's blocks is added to the diagonal of A. The sum is no less than A plus the
-    blocks, so that a direct solve with it gives a descent direction, too.
+    The options -pc_... choose the preconditioner for every preset, since A also preconditions the
+    true Hessian. A bound on the blocks of contact is added to the diagonal of A. The sum is no less
+    than A plus the blocks, so that a direct solve with the sum gives a descent direction, too.
 
     matrix  : A (m, m), a copy if there may be contact
     touches : whether there may be contact
-    own     : (m,) diagonal of A, of this rank [kg]
-    added   : (m,) addition to the diagonal, over t^2 [N/m]
+    own     : (m,) this rank's diagonal of A [kg]
+    added   : (m,) bound that is added to the diagonal, over t^2 [N/m]
     """
 
     is_uniform = False
@@ -145,7 +150,7 @@ class MatrixPreconditioner(StepPreconditioner):
         self.pc.setFromOptions()
 
     def _apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Write P^-1 x to y, all three columns in a single call, as MUMPS can."""
+        """Write P^-1 x to y, with all three columns in a single call, which MUMPS supports."""
         memory = self.unknowns.memory
         if not self.blocks:
             # A direct solver works on the CPU
@@ -164,12 +169,13 @@ class MatrixPreconditioner(StepPreconditioner):
 
 
 class LatticePreconditioner(StepPreconditioner):
-    """Multigrid of the Hessian, its hierarchy kept while it saves time.
+    """Multigrid of the Hessian, with a hierarchy that is kept while this saves time.
 
-    matrix, pc   : projected Hessian, and PETSc's PCMG of it
-    translations : of bodies without fixed nodes, exact while ``is_free``; None if all are fixed
+    matrix, pc   : projected Hessian, and PETSc's PCMG for it
+    translations : exact translations of free bodies, used while ``is_free``; None if no body is
+                   free
     is_first     : whether there is no hierarchy yet
-    rate         : iterations per digit of the first solve with the hierarchy; None before it
+    rate         : iterations per digit in the first solve with the hierarchy; None before it
     excess       : iterations above this rate since then
     is_stale     : whether a new hierarchy is due
     is_new       : whether the hierarchy was built at the positions of the next linear solve
@@ -194,10 +200,10 @@ class LatticePreconditioner(StepPreconditioner):
         return self.multigrid.fine.products
 
     def prepare(self, q: Positions, contact: StepContactAt | None) -> bool:
-        """Build a hierarchy at positions q (l, 3) [m] if it is due; return whether it changed.
+        """Build a hierarchy at positions q (l, 3) [m] if due. Return whether the hierarchy changed.
 
-        A kept hierarchy follows the contact of single nodes: a node that has come into contact
-        costs several iterations.
+        A kept hierarchy follows the contact of single nodes, since each node that has come into
+        contact would cost several iterations.
         """
         self.is_free, self.is_new = self._is_free(q, contact), self.is_stale
         if self.is_new:
@@ -208,7 +214,7 @@ class LatticePreconditioner(StepPreconditioner):
         return self.is_new
 
     def _follow(self, contact: Rows) -> bool:
-        """Give the hierarchy the present contact (owned, 9) [N/m]; return whether it changed."""
+        """Give the hierarchy the present contact (owned, 9) [N/m]. Return whether that changed."""
         changed = not np.array_equal(contact, self.multigrid.fine.contact)
         changed = bool(reduced(self.unknowns.comm, changed, MPI.LOR))
         if changed:
@@ -217,9 +223,9 @@ class LatticePreconditioner(StepPreconditioner):
         return changed
 
     def most_iterations(self, rtol: float) -> int | None:
-        """Return the most iterations of a solve to a relative tolerance with this hierarchy.
+        """Return the greatest number of iterations of a solve with an old hierarchy.
 
-        Return None for a hierarchy of the present positions.
+        Return None if the hierarchy is of the present positions, or before its first solve.
         """
         return (
             None
@@ -230,8 +236,8 @@ class LatticePreconditioner(StepPreconditioner):
     def learn(self, its: int, rtol: float) -> None:
         """Count the iterations of a linear solve to a relative tolerance.
 
-        A hierarchy is kept until its excess iterations have cost as much as a new hierarchy. The
-        total cost is at most twice the least.
+        A hierarchy is kept until its excess iterations have cost as much as a new hierarchy. So the
+        total cost is at most twice the least possible cost.
         """
         if its == 0:
             return
@@ -251,9 +257,9 @@ class LatticePreconditioner(StepPreconditioner):
         self.is_first = self.is_stale = False
 
     def _is_free(self, q: Positions, contact: StepContactAt | None) -> bool:
-        """Return whether no obstacle presses on a node at positions q (l, 3) [m].
+        """Return whether mass alone resists translations of free bodies, at q (l, 3) [m].
 
-        Translations are then resisted by mass alone.
+        This holds if there are free bodies, and no contact presses on them.
         """
         if self.translations is None or contact is None:
             return self.translations is not None
@@ -261,13 +267,13 @@ class LatticePreconditioner(StepPreconditioner):
         alone = len(self.multigrid.bodies.free) == 1 and not (
             surface and surface.contacts.obstacles.total
         )
-        # The self-contact of a lone body moves its centre no more than springs do
+        # Self-contact of a single body does not move its centre, like springs
         if surface and not alone and surface.presses(q):
             return False
         return not reduced(self.unknowns.comm, contact.presses_nodes, MPI.LOR)
 
     def _blocks(self, contact: StepContactAt | None) -> Rows:
-        """Return the Hessian (owned, 9) of obstacles, with the secant of friction.
+        """Return the Hessian (owned, 9) [N/m] of obstacles on nodes, with the secant of friction.
 
         Return (0, 9) without contact.
         """
@@ -291,7 +297,7 @@ class LatticePreconditioner(StepPreconditioner):
                 self.pc.apply(x, y)
 
     def forget(self) -> None:
-        """Forget the hierarchy, so that the next step builds another."""
+        """Forget the hierarchy, so that the next step builds a new hierarchy."""
         self.is_stale = self.is_first = True
         self.multigrid.contact.destroy()
 
@@ -300,5 +306,5 @@ class LatticePreconditioner(StepPreconditioner):
 
 
 def _digits(rtol: float) -> float:
-    """Return the digits that a solve to this tolerance gains, at least 0.1."""
+    """Return the number of digits that a solve to a relative tolerance gains, at least 0.1."""
     return max(-float(np.log10(rtol)), 0.1)

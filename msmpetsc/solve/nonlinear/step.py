@@ -34,11 +34,11 @@ from msmpetsc.solve.petsc.library import petsc_errors, total_iterations
 from msmpetsc.solve.presets import Preset, SolverOptions
 from msmpetsc.solve.work import Work
 
-# Most doubts in a step: saddles, and errors larger than estimated
+# Greatest number of doubts in a step: saddles, and errors larger than estimated
 DOUBTS = 100
 # Options of SNES that the loop of Newton's method (nonlinear.newton) does not use
 OF_SNES = ("snes_type", "snes_linesearch", "snes_ksp_ew", "npc_snes")
-# Options of SNES that name this very loop, and are accepted
+# Options of SNES that name this loop and are accepted
 LOOP = {"snes_type": "newtonls", "snes_linesearch_type": "bt"}
 
 
@@ -47,23 +47,23 @@ class StepResult:
     """Result of a step.
 
     position     : (l, 3) [m], ghosts included
-    previous     : (l, 3) [m], such that the velocity is (position - previous) / t
+    previous     : (l, 3) [m], for the velocity (position - previous) / t
     cost         : work of the step
     work         : work of obstacles that struck this rank's nodes [J]
-    explicit     : whether the step was taken in explicit substeps; ``work`` then includes all that
-                   moved or pushed
-    swing        : known change of energy as the scheme oscillates, of this rank's nodes
+    explicit     : whether the step was taken in explicit substeps; ``work`` then also includes
+                   loads and anchors
+    swing        : known oscillation of the energy of this rank's nodes over the step
                    (solve.energy_balance) [J]
     static       : whether the result is an equilibrium, not a motion
     time_error   : estimated error of the trajectory so far; NaN without an estimate
     problem      : F = M (x - y) + tau^2 (grad E - f_ext), without M in statics; None if explicit
     energy_tolerance : energy [J]; if g / tau^2 is this close to its minimum, x meets the error
-    tau          : [s]
-    viscous      : forces of viscosity (owned, 3) [N]
+    tau          : tau of the problem [s]
+    viscous      : gradient of the dissipation potential D (owned, 3) [N]; None without viscosity
     begun_error  : error of the history that a BDF2 step without history computes for itself
                    (solve.integrators.implicit.Bdf2) [m sqrt(kg)]
-    viscous_work : fall of the dissipation potential D from ``problem.fixed_positions`` to
-                   ``position``, this rank's part [J]
+    viscous_work : decrease of D from ``problem.fixed_positions`` to ``position``, this rank's part
+                   [J]
     """
 
     position: Positions
@@ -86,12 +86,14 @@ class StepResult:
 class Stepper:
     """Solver of the steps of one lattice and time step.
 
-    ``destroy`` destroys all PETSc objects that it creates.
+    ``destroy`` destroys all PETSc objects that the stepper has created.
 
-    touches : whether steps may have a ``contact``
-    prefix  : of the PETSc options
-    static  : whether steps are equilibria; M then weighs errors only
-    solid   : of the lattice's cells, to share its memory; None to make it
+    error          : greatest relative error of a step; None for the default, or for the budget
+    max_iterations : budget of iterations; None for the preset's budget
+    touches        : whether steps may have a ``contact``
+    prefix         : prefix of the PETSc options
+    static         : whether steps are equilibria; M then only weights errors
+    solid          : solid of the lattice's cells, to share its memory; None to make it
 
     Raises InputError for options that contradict each other, on all ranks.
     """
@@ -138,12 +140,12 @@ class Stepper:
             raise
 
     def _keep(self, owned: PETSc.Object) -> PETSc.Object:
-        """Return an object that ``destroy`` will destroy."""
+        """Let ``destroy`` destroy an object; return the object."""
         self.owned.callback(owned.destroy)
         return owned
 
     def _create_solvers(self) -> tuple[PETSc.SNES, PETSc.KSP]:
-        """Create the SNES, and return its KSP or the KSP of the SNES that preconditions it."""
+        """Return a new SNES, and its KSP or the KSP of the SNES that preconditions it."""
         snes, prefix = self._keep(PETSc.SNES().create(self.comm)), self.prefix
         snes.setOptionsPrefix(prefix)
         # Whether a plain iteration preconditions SNES
@@ -154,7 +156,7 @@ class Stepper:
         ksp = self._keep(inner.getKSP())
         ksp.setOptionsPrefix(prefix)
         pc = self._keep(ksp.getPC())
-        # The bare options -pc_ are for the preconditioner inside, of A or of H
+        # The options -pc_ without a prefix are for the preconditioner of A or H inside
         pc.setOptionsPrefix(f"{prefix}three_columns_")
         pc.setType(PETSc.PC.Type.PYTHON)
         pc.setPythonContext(self.jacobian.preconditioner)
@@ -207,7 +209,7 @@ class Stepper:
     def set_up(self) -> None:
         """Build the preconditioner before the first step; Cholesky factorises here.
 
-        Raises InputError for a preconditioner that this PETSc or matrix does not have.
+        Raises InputError for a preconditioner that this PETSc lacks or the matrix does not support.
         """
         with petsc_errors("PETSc cannot set up the solver", self):
             # Chebyshev's method applies the operator for eigenvalue bounds
@@ -219,7 +221,7 @@ class Stepper:
     def step(self, problem: StepProblem, start: Rows | None = None) -> StepResult:
         """Return the result of a step.
 
-        start : first guess (l, 3) [m]; None for the best of several
+        start : first guess (l, 3) [m]; None for the best of several guesses
 
         Raises StepFailed on all ranks, and StepStopped after a signal. Raises InputError if PETSc's
         options contradict each other, or if loads are too great (Rounding.refuse_loads).
@@ -257,7 +259,7 @@ class Stepper:
     def _first(self, start: Iterate, outcome: Outcome) -> tuple[Iterate, Outcome]:
         """Minimise g from the start of a step (collective).
 
-        If the first iteration of a static state overshoots, minimise with smaller lambdas first.
+        If the first iteration of a static state overshoots, minimise with smaller lambda first.
 
         Raises StepFailed, StepStopped and InputError.
         """
@@ -278,12 +280,12 @@ class Stepper:
         )
 
     def _softened(self, newton: Newton, now: Iterate) -> Iterate:
-        """Return the solution with the greatest of several lambdas below the solid's own.
+        """Return a start for the solid's own lambda: the last of several softer solutions.
 
         Lambda is mu at first, then grows by the factor SOFTER from solution to solution. A straight
-        step changes volumes, which resist in proportion to lambda; between these solutions volumes
-        change little. The first Hessian of each solve keeps the slopes V U' of the last solution,
-        since its own lambda would make them far too large.
+        step changes volumes, which resist in proportion to lambda. Between these solutions volumes
+        change little. The first Hessian of each solve keeps the slopes V U' of the last solution.
+        The solve's own lambda would make the slopes far too large.
 
         Raises StepFailed and StepStopped.
         """
@@ -300,9 +302,9 @@ class Stepper:
         return self.functional.at(now.q)
 
     def forget(self, modes: bool = True) -> None:
-        """Forget earlier steps, so that the next step does not depend on them.
+        """Forget data of earlier steps, so that the next step does not depend on them.
 
-        modes : forget lowest modes, too
+        modes : whether to forget the lowest mode, too
         """
         self.first_guess.forget()
         self.jacobian.preconditioner.forget()
@@ -311,7 +313,7 @@ class Stepper:
             self.optimality.curvature.forget()
 
     def work_so_far(self) -> Work:
-        """Return the work of all steps so far, with estimates and searches for modes."""
+        """Return the work of all steps so far, estimates and searches for modes included."""
         of_estimates = total_iterations(self.control.estimate.ksp)
         ksp_its = total_iterations(self.ksp) + of_estimates + self.optimality.curvature.search.its
         products = self.jacobian.hessian.products + self.jacobian.preconditioner.products
@@ -328,7 +330,7 @@ class Stepper:
         return self.work_so_far() - self.before
 
     def examine(self, now: Iterate, outcome: Outcome) -> Verdict:
-        """Return whether an iterate is a minimum, and its error (collective)."""
+        """Return the verdict whether an iterate is a minimum, with its error (collective)."""
         control = self.control
         outcome = control.with_compression(now, outcome)
         assert outcome.compression is not None
@@ -345,9 +347,9 @@ class Stepper:
     def _leave(
         self, now: Iterate, verdict: Verdict, outcome: Outcome
     ) -> tuple[Iterate, Outcome] | None:
-        """Return an iterate of lower g and its outcome so far (collective).
+        """Return the iterate and the outcome from which the step goes on (collective).
 
-        Return None if the step can neither move nor become more accurate. The step then ends with
+        Return None if the step can neither move nor become more accurate. Then the step ends with
         the error of the verdict.
 
         Raises StepFailed.

@@ -28,7 +28,7 @@ GPU_AWARE_MPI = "use_gpu_aware_mpi"
 def choose(comm: MPI.Comm, device: str | None) -> None:
     """Set the matrix type of runs from ``--device`` (collective).
 
-    Raises InputError if ``-mat_type`` contradicts it, or if the device is not available.
+    Raises InputError if ``-mat_type`` contradicts the device, or if the device is not available.
     """
     mat_type = PETSc.Options().getAll().get(OPTION)
     if device and mat_type is not None and (mat_type in ON_GPU) != (device == "cuda"):
@@ -41,7 +41,8 @@ def choose(comm: MPI.Comm, device: str | None) -> None:
 def sender(comm: MPI.Comm) -> Callable[[Array], Array]:
     """Return a function that copies arrays to the device of the run (collective).
 
-    Raises InputError on all ranks if the device is a GPU, but a rank has none or PETSc lacks CUDA.
+    Raises InputError on all ranks if the device is a GPU, but a rank lacks a GPU or PETSc lacks
+    CUDA.
     """
     if PETSc.Options().getAll().get(OPTION) not in ON_GPU:
         return lambda array: array
@@ -53,17 +54,18 @@ def sender(comm: MPI.Comm) -> Callable[[Array], Array]:
             raise InputError(f"--device cuda (-{OPTION} {wanted}): {lacking}")
     import cupy
 
-    # PETSc takes the same GPU out of several.
+    # If there are several GPUs, PETSc takes the same GPU.
     cupy.cuda.Device(PETSc.COMM_WORLD.rank % cupy.cuda.runtime.getDeviceCount()).use()
     if GPU_AWARE_MPI not in PETSc.Options().getAll():
-        # An MPI without GPU support stops PETSc. PETSc has read its options already.
+        # Otherwise PETSc stops at an MPI without GPU support. The variable is set
+        # directly, because PETSc has already read its options.
         ctypes.c_bool.in_dll(petsc_library(), GPU_AWARE_MPI).value = False
     send: Callable[[Array], Array] = cupy.asarray
     return send
 
 
 def what_is_missing() -> str | None:
-    """Return why this process cannot compute on a GPU, in words; None if it can."""
+    """Return the reason why this process cannot compute on a GPU, as text; None if it can."""
     if not PETSc.Sys.hasExternalPackage("cuda"):
         return (
             "this PETSc was built without CUDA; scripts/build_petsc_cuda builds a PETSc with CUDA"
@@ -72,7 +74,7 @@ def what_is_missing() -> str | None:
 
 
 def missing_cuda() -> str | None:
-    """Return why Python cannot use a GPU, in words; None if it can.
+    """Return the reason why Python cannot use a GPU, as text; None if it can.
 
     The test asks the CUDA runtime, because PETSc crashes at exit if there is no GPU.
     """
@@ -89,7 +91,7 @@ def missing_cuda() -> str | None:
 
 
 class Memory:
-    """Access to PETSc's vectors and matrices in CPU memory, with PETSc's names of their types."""
+    """Access to PETSc's vectors and matrices in CPU memory, and PETSc's names of their types."""
 
     vec_type, mat_type = PETSc.Vec.Type.STANDARD, PETSc.Mat.Type.AIJ
 
@@ -98,7 +100,7 @@ class Memory:
         return np.asarray(vector.array_r)
 
     def write(self, vector: PETSc.Vec) -> Floats:
-        """Return this rank's numbers of a vector for reading and writing at once."""
+        """Return this rank's numbers of a vector, for immediate reading and writing."""
         return np.asarray(vector.array)
 
     def over(self, array: Floats, comm: PETSc.Comm) -> PETSc.Vec:
@@ -106,11 +108,15 @@ class Memory:
         return PETSc.Vec().createWithArray(array, (len(array), None), comm=comm)
 
     def dense(self, rows: tuple[int, int], columns: int, comm: PETSc.Comm) -> PETSc.Mat:
-        """Return a dense matrix; ``rows`` are the numbers of rows of this rank and of all."""
+        """Return a dense matrix.
+
+        rows    : number of this rank's rows, and of all rows
+        columns : number of columns
+        """
         return _ready(PETSc.Mat().createDense((rows, (None, columns)), comm=comm))
 
     def values(self, dense: PETSc.Mat) -> Floats:
-        """Return this rank's part of a dense matrix by columns, to be used at once."""
+        """Return this rank's part of a dense matrix by columns, for immediate use."""
         return np.asarray(dense.getDenseArray().T.reshape(-1))
 
 
@@ -118,7 +124,7 @@ class CudaMemory(Memory):
     """Access to PETSc's vectors and matrices in GPU memory.
 
     A pointer is restored at once, as petsc4py does for DLPack, so that PETSc takes the GPU's copy
-    as valid. Later writes are safe, because they use PETSc's stream, the default stream.
+    as valid. Later writes are safe, because PETSc and CuPy both use the default stream.
     """
 
     vec_type, mat_type = PETSc.Vec.Type.CUDA, PETSc.Mat.Type.AIJCUSPARSE
@@ -149,7 +155,7 @@ class CudaMemory(Memory):
 
 
 def view(pointer: int, size: int) -> Floats:
-    """Return GPU memory owned by PETSc as an array (size,), valid as long as the memory."""
+    """Return GPU memory owned by PETSc as an array (size,), valid while PETSc keeps the memory."""
     import cupy
 
     numbers: Floats = cupy.empty(0)

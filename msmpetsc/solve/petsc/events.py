@@ -1,7 +1,7 @@
 """Events and stages of a run for -log_view.
 
-Nested events both count the time, as PETSc's events do: KSPSolve includes its products. For the
-levels of multigrid, see -pc_mg_log.
+An event includes the time of events nested in it, as PETSc's events do: KSPSolve includes its
+products. For the levels of multigrid, see -pc_mg_log.
 """
 
 from contextlib import ExitStack
@@ -34,7 +34,7 @@ ESTIMATE = PETSc.Log.Event("msmpetsc estimate")
 CONTACT = PETSc.Log.Event("msmpetsc contact")
 GHOSTS = PETSc.Log.Event("msmpetsc ghosts")
 FILES = PETSc.Log.Event("msmpetsc output")
-# spring-by-spring work outside of KSP
+# work of a method outside its linear solves
 LOCAL = PETSc.Log.Event("msmpetsc local")
 
 

@@ -1,6 +1,6 @@
 """Start PETSc with the user's options, and lend options to a PETSc that runs already.
 
-PETSc reads most options that belong to no solver only at its start.
+Most options that belong to no solver are read by PETSc only at its start.
 """
 
 import atexit
@@ -39,7 +39,7 @@ def initialise(comm: MPI.Comm, words: list[str]) -> None:
 
     Raises InputError if an options file cannot be read or PETSc refuses a value at its start.
     """
-    # Only rank 0 of PETSc reads option files: its error would block the other ranks.
+    # Only rank 0 of PETSc reads options files. An error there would block other ranks.
     on_root(comm, lambda: _check_words(words))
     failed = None
     with _captured_stderr() as text:
@@ -77,7 +77,7 @@ def _check_words(words: list[str]) -> None:
 
 
 def _check_lines(where: str, lines: list[str]) -> None:
-    """Raise InputError for a line that is neither an option, maybe with a value, nor an alias."""
+    """Raise InputError for a line that is neither an option, with or without value, nor alias."""
     for number, line in enumerate(lines, 1):
         tokens = TOKEN.findall(line.partition("#")[0])
         if tokens and tokens[0] in NOT_HERE:
@@ -97,7 +97,10 @@ def _check_lines(where: str, lines: list[str]) -> None:
 
 @contextmanager
 def _captured_stderr() -> Iterator[list[str]]:
-    """Capture the standard error of the process, C code included; fill it in after the block."""
+    """Capture the standard error of the process, C code included; yield a list for its text.
+
+    The list has the text after the block.
+    """
     text = [""]
     sys.stderr.flush()
     saved_stderr = os.dup(2)

@@ -1,4 +1,4 @@
-"""PETSc's C functions that petsc4py lacks, and PETSc errors as InputError of a single line."""
+"""PETSc's C functions that petsc4py lacks, and PETSc errors as InputError with a single line."""
 
 import ctypes
 import gc
@@ -23,7 +23,7 @@ INSERT = int(PETSc.InsertMode.INSERT_VALUES)
 def petsc_library() -> ctypes.CDLL:
     """Return PETSc's C library.
 
-    PyDLL keeps Python's lock, because PETSc may call Python.
+    Calls keep Python's lock (PyDLL), because PETSc may call Python.
     """
     # petsc4py's extension module also exports the symbols of libpetsc.
     return ctypes.PyDLL(PETSc.__file__)
@@ -139,21 +139,21 @@ def petsc_errors(heading: str, owner: Owner | None = None) -> Iterator[None]:
     """Turn PETSc errors of the block, or of the decorated function, into an InputError.
 
     PETSc raises ImportError if an object of type python has no context. Python's garbage collector
-    rests meanwhile.
+    is off in the block.
 
     heading : beginning of the message, which ends with PETSc's own message
-    owner   : of PETSc objects in use, which are kept for ever after an error
+    owner   : owner of the PETSc objects in use, which are kept for ever after an error
     """
     collects = gc.isenabled()
-    # Since Python 3.12 garbage may be collected in petsc4py's error handler. That
-    # discards the exception on its way through PETSc, without which petsc4py crashes.
+    # Since Python 3.12 garbage may be collected in petsc4py's error handler. This
+    # discards the exception that passes through PETSc, and petsc4py crashes without it.
     gc.disable()
     try:
         yield
     except (PETSc.Error, ImportError) as error:
-        # An exception of Python code within PETSc is the cause of newer petsc4py's
-        # error. Its traceback holds this frame: a second name for it here would keep
-        # PETSc's objects alive.
+        # In newer petsc4py, an exception of Python code within PETSc is the cause of
+        # the error. Its traceback holds this frame, so a second name for the exception
+        # here would keep PETSc's objects alive.
         cause = error.__cause__
         if cause is not None and not isinstance(cause, (PETSc.Error, ImportError)):
             raise cause  # noqa: B904

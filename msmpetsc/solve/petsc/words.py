@@ -30,7 +30,7 @@ def unsafe_word(words: Sequence[str]) -> str | None:
 
 
 def options_of(words: Sequence[str]) -> dict[str, str]:
-    """Return words as a table of options: name without dash -> value, or "" without a value."""
+    """Return words as a table of options: name without dash -> value; "" without a value."""
     options: dict[str, str] = {}
     name = None
     for word in words:
@@ -43,7 +43,9 @@ def options_of(words: Sequence[str]) -> dict[str, str]:
 
 
 def words_of(options: str | Mapping[str, Any]) -> list[str]:
-    """Return options given in Python as a list of words. Raises InputError for non-options.
+    """Return options given in Python as a list of words.
+
+    Raises InputError for text that is no option.
 
     options : "-ksp_rtol 1e-3 -ksp_view" or {"ksp_rtol": 1e-3, "ksp_view": None}
     """

@@ -64,7 +64,7 @@ def reduced(comm: MPI.Comm, values: ArrayLike, op: MPI.Op | None = None) -> Any:
     own = np.array(values, order="C")
     result = np.empty_like(own)
     comm.Allreduce(own, result, *(() if op is None else (op,)))
-    return result[()]
+    return result if result.ndim else result.item()
 
 
 class Stop:

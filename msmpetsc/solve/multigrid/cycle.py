@@ -48,8 +48,8 @@ from msmpetsc.solve.petsc.library import (
 # greatest number of nodes of the coarsest grid, whose matrix is factored; coarser grids
 # lose thin limbs
 COARSEST = 1000
-# the same, over the square root of the lattice's nodes; the factor of a larger grid takes
-# as long as the finest level
+# the same, over the root of the lattice's number of nodes; the factor of a larger grid
+# takes as long as the finest level
 COARSEST_ROOT = 9.0
 # greatest number of surface points that the finest smoother couples; its matrix is
 # dense

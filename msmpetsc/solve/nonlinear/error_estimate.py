@@ -111,7 +111,7 @@ class ErrorEstimate:
         self.lowest, self.is_accepted, self._acceptable = self.convexity, False, acceptable
 
     def test(self, ksp: PETSc.KSP, its: int, residual: float) -> PETSc.KSP.ConvergedReason:
-        """Return KSP's reason to end Newton's solve H e = F, or to go on (KSPSetConvergenceTest)."""
+        """Return KSP's reason to end Newton's solve H e = F, or to go on."""
         reasons, (rtol, atol, divtol, _) = PETSc.KSP.ConvergedReason, ksp.getTolerances()
         if not np.isfinite(residual):
             return reasons.DIVERGED_NANORINF

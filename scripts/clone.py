@@ -1,4 +1,4 @@
-"""Select the clone's own Python and package for a script; to be imported first."""
+"""Select the clone's own Python and package for a script; the script must import this first."""
 
 import os
 import sys
@@ -6,7 +6,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-# created by scripts/setup
+# scripts/setup creates it
 PYTHON = ROOT / ".venv" / "bin" / "python"
 # packages without which a Python cannot run msmpetsc
 NEEDED = ("numpy", "numba", "petsc4py", "mpi4py")

@@ -4,11 +4,11 @@
     scripts/error_study.py [--scenes 500] [--seed 1] [--kinds any rub far touch] [--only K]
         [--set KEY=VALUE ...]
 
-A scene is drawn from its seed and number. The body has 40 to 150 cells: a beam, cube, plate or
-ball, tilted or not, soft or stiff, of either law, in parts with a contrast of up to 1e6. It is
-squashed, stretched, twisted, scattered, spinning, thrown, or pressed between plates with friction.
-It is pinned, anchored or free; steps are short or long, and presets vary. Each step is solved again
-to rounding error from its end. The ratio of the estimate to that distance is reported.
+The seed and a number determine a scene. The body has 40 to 150 cells: a beam, cube, plate or ball,
+tilted or not, soft or stiff, of either law, in parts with a stiffness ratio of up to 1e6. It starts
+squashed, stretched, twisted, scattered, spinning or thrown, or plates press it with friction. It is
+pinned, anchored or free; steps are short or long, and presets vary. The script solves each step
+again to rounding, from its end. It reports the ratio of the estimate to the true error.
 
 --kinds alternates between kinds of scenes:
 
@@ -17,7 +17,7 @@ to rounding error from its end. The ratio of the estimate to that distance is re
     far   : starts that are mirrored, collapsed, scattered or in fast spin
     touch : bodies that fall on an edge or a corner
 
-The exit status is 1 if a step's estimate is below a third of its true error, or if a scene ends in
+The exit status is 1 if a step reports less than a third of its true error, or if a scene ends in
 a fault. --only K runs scene K alone, keeps its files in out/error_study/SEED, and prints each step.
 """
 
@@ -44,7 +44,7 @@ KINDS = ("any", "rub", "far", "touch")
 # true error below which rounding prevents a comparison
 ROUNDING = 1e-9
 ERRORS = (1e-1, 1e-2, 1e-3, 1e-3, 1e-3, 1e-5)
-# exit status of each way to end; any other status is a fault
+# exit status of each expected end; any other status is a fault
 ENDS = {"done": 0, "stopped": 3, "refused": 2, "cut off": None}
 FOLDER = lab.OUT / "error_study"
 Draw = np.random.Generator

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Measure the source of a clone: lines of its rooms, long functions, tuned numbers.
+"""Measure the source of a clone: lines of its folders, long functions, tuned numbers.
 
 scripts/house.py [FOLDER]
 """

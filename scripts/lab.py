@@ -52,7 +52,7 @@ class Run:
 
     @cached_property
     def cost(self) -> dict[str, Any]:
-        """The contents of the file that `run --measure` has written."""
+        """Return the contents of the file that `run --measure` has written."""
         return json.loads(self.path.with_suffix(".json").read_text())
 
     def frames(self, *names: str, start: int = 1) -> dict[str, np.ndarray]:
@@ -97,8 +97,8 @@ def file_of(scene: str | Path) -> Path:
 
 
 def python(words: Iterable[object], log: Path, ranks: int = 1, timeout: float = DAY) -> Ended:
-    """Run Python with these arguments to its end; ``log`` gets all output."""
-    # study.cases has a launcher, but its import starts PETSc
+    """Run Python with these arguments to its end; write all output to ``log``."""
+    # study.cases has a launcher, but importing it starts PETSc
     launcher = ["mpiexec", "-n", str(ranks)] if ranks > 1 else []
     return PROCESSES.run([*launcher, sys.executable, *map(str, words)], log, timeout)
 
@@ -116,7 +116,7 @@ def box(path: Path, sides: Sequence[float] | np.ndarray) -> str:
 def alternated(kinds: Mapping[str, Callable[[], T | None]], repeats: int) -> dict[str, list[T]]:
     """Call each function ``repeats`` times in turn; return the values of each by its name.
 
-    After a function has returned None, it is not called again, and its list is empty.
+    A function that has returned None is not called again, and its list is empty.
     """
     values: dict[str, list[T]] = {name: [] for name in kinds}
     failed = set()
@@ -153,7 +153,7 @@ def percent(share: float, digits: int = 1) -> str:
 
 
 def table(rows: Iterable[Row]) -> None:
-    """Print rows as they come, and a new heading whenever a row has a new column."""
+    """Print rows as they come, with a new heading whenever a row has a new column."""
     columns: list[str] = []
     for row in rows:
         if not set(row) <= set(columns):
@@ -168,7 +168,7 @@ def parser(documentation: str | None) -> ArgumentParser:
 
 
 def heading() -> None:
-    """Print a script's command, the date and the machine as heading of its tables."""
+    """Print a script's command, the date and the machine as the heading of its tables."""
     name, *words = sys.argv
     print(
         f"# {Path(name).name}\n\n```sh\n{shlex.join([f'scripts/{Path(name).name}', *words])}\n```\n"

@@ -5,8 +5,9 @@
 
 The finer run has 32 times the cells of the choice, or 8 times if that exceeds the time limit. It
 has at least a quarter more cells than the plan's finest trial. Its steps are explicit substeps, or
-implicit for a quarter of the choice's time error; a static scene remains static. If no choice meets
-the error, the choice of least error is compared. SCENE is a name of the study or a scene file.
+implicit with a quarter of the choice's time error; a static scene remains static. If no choice
+meets the error, the choice with the least error is compared. SCENE is a name of the study or a
+scene file.
 """
 
 import json
@@ -27,7 +28,8 @@ from msmpetsc.study.sizing.choice import PlannedMethod, overrides, tables
 ERRORS = (0.1, 0.03, 0.01)
 # time limit of a finer run [s]
 LIMIT = 900.0
-# ratios of cells of the finer run; 8 halves the edge, and a first-order error
+# ratios of cells of the finer run to the choice; 8 halves the edge, and so a
+# first-order error
 FINER = (32, 8)
 # least ratio of cells to the plan's finest trial
 MORE = 1.25
@@ -87,7 +89,7 @@ class Planned(NamedTuple):
         finest = max(each["cells"] for each in self.answer["tried"])
         if method.integrator == STATIC:
             method = replace(method, step_error=1e-3)
-        # verlet's substeps shrink with the cells by themselves
+        # verlet's substeps shrink with the cells
         elif method.time_error:
             method = replace(method, time_error=method.time_error / TIGHTER)
         for times in FINER:

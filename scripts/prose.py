@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
 """Check the English of docstrings and comments:  scripts/prose.py [options] [files or folders]
 
-Print each offence with its place, then the rates of each folder. With --quiet print faults alone.
+Print each offence with its place, then the rates of each folder. With --quiet print only faults.
 Exit with status 1 if a sentence is too long or begins badly, or if a comment stands behind code or
-is too wide. The same holds if a folder has too many of the vague words.
+is too wide. Also exit with status 1 if a folder has too many of the vague words.
 """
 
 import argparse
@@ -21,7 +21,7 @@ ROOT = Path(__file__).parent.parent
 # limits: words of a sentence, columns of a comment
 LONGEST = 25
 WIDEST = 88
-# words of a folder from which its rates count
+# number of words from which the rates of a folder count
 LEAST_WORDS = 200
 # most of these words in 1,000, as counted in models of good style: PyFR, scikit-fem,
 # lineax

@@ -4,19 +4,19 @@
     scripts/scene_tables.py table1|tissue|touching [SCENE...] [--frames N] [--shorter N]
         [--set KEY=VALUE ...]
 
-table1 has the paper's Table 1 with our figures, the paper's in brackets. Each scene runs with its
-springs, and as neo-Hookean solid of the same Young's modulus and Poisson's ratio 1/4. Frames a
-second count the steps alone: the mean, and the mean of the slowest tenth. Products with the Hessian
-are per frame. The error is the largest relative step error that the runs report.
+table1 is the paper's Table 1 with our figures, and the paper's in brackets. Each scene runs with
+its springs, and as a neo-Hookean solid of the same Young's modulus and Poisson's ratio 1/4. Frames
+a second are of the steps only: the mean, and the mean of the slowest tenth. Products with the
+Hessian are per frame. The error is the largest relative step error that the runs report.
 
-tissue has neo-Hookean solids of Poisson's ratio 0.47. The volume is that within the drawn surface
-relative to rest: the largest loss and gain of any frame, and at the end. "Inside out" is the
-largest number of inverted cells of any frame.
+tissue runs neo-Hookean solids of Poisson's ratio 0.47. The volume within the drawn surface is given
+relative to rest: the largest loss and gain of any frame, and the change at the end. "Inside out" is
+the largest number of inverted cells of any frame.
 
-touching has surfaces in self-contact; a SCENE may be a file. "Crossed" counts edges that cross
+touching runs scenes with self-contact; a SCENE may be a file. "Crossed" counts edges that cross
 triangles of the collision surface in any frame, by a test independent of the contact code. "Drawn"
-counts crossings of the drawn surface in 20 frames. CPU is the process's time spent on steps, with
-contact and without [self_contact]. --shorter 16 divides steps and frames by 16.
+counts crossings of the drawn surface in 20 frames. CPU is the processor time of the steps with
+contact, and without [self_contact]. --shorter 16 divides steps and frames by 16.
 """
 
 import re
@@ -61,7 +61,7 @@ def mean(result: Result, *names: str) -> dict[str, float]:
 
 # ---- the paper's Table 1
 
-# vertices, facets, valid cells, springs, frames a second on the CPU and on the GPU
+# vertices, facets, valid cells, springs, frames per second on the CPU and on the GPU
 PAPER = {
     "armadillo": (12602, 25200, 8338, 164343, 8.1, 30.0),
     "dragon": (23620, 47140, 11536, 232240, 5.5, 23.9),

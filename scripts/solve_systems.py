@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Solve linear systems of `--export` by any of PETSc's solvers, beside our multigrid.
+"""Solve linear systems of `--export` by any of PETSc's solvers, and compare with our multigrid.
 
 scripts/solve_systems.py out/systems/*/step_1 --options "-pc_type gamg" "-pc_type hypre"
 """

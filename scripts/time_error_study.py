@@ -3,9 +3,9 @@
 
     scripts/time_error_study.py
 
-The truth is the same scene by BDF2 in equal steps, a 64th of the scene's step (bunny: a 16th,
-heart: a 256th). Both errors are relative: the estimate to the largest displacement so far, the
-true error to the mean displacement (study.metrics.trajectory_error).
+The reference is the same scene by BDF2 in equal steps, a 64th of the scene's step (bunny: a 16th,
+heart: a 256th). Both errors are relative: the estimate to the largest displacement so far, the true
+error to the mean displacement (study.metrics.trajectory_error).
 """
 
 from pathlib import Path
@@ -46,7 +46,7 @@ SHIPPED = {
     "heart of 1,000 cells, pulled and let go": ("heart_pull", 0.9),
 }
 ERRORS = (0.1, 0.03, 0.01)
-# equal steps of the truth in a step of the scene
+# equal steps of the reference in a step of the scene
 PARTS, PARTS_OF = 64, {"bunny_fall": 16, "heart_pull": 256}
 
 

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
-"""Hold runs of scenes against published values: a table, a chart.
+"""Compare runs of scenes with published values: a table and a chart.
 
     scripts/yardstick.py [--fast] [WORD ...] | tee scripts/results/yardstick.md
 
-The cases stand in scenes/studies/yardstick/cases.toml, each with a scene beside it. A WORD chooses
-the cases whose names contain it. --fast runs the coarse sizes of each, which the tests run.
-Seconds are processor time of the steps of a run, without its set-up.
+The cases are in scenes/studies/yardstick/cases.toml, each with a scene beside it. A WORD selects
+the cases whose names contain it. --fast runs only the coarse sizes of each case, which the tests
+run too. Seconds are processor time of the steps of a run, without its set-up.
 """
 
 import math
@@ -66,7 +66,7 @@ class Value:
 
     ours      : Python expression of the names that ``names_of`` returns
     reference : number, or Python expression of the case's constants
-    within    : largest |error|, a number or a Python expression of n; "" for the case's
+    within    : largest |error|, a number or a Python expression of n; "" for the case's own
     note      : cause of a deviation over 2% at the finest size
     """
 
@@ -93,13 +93,13 @@ class Case:
 
     scene   : name of the scene beside the table
     setup   : the problem in a line; source: where a reader finds the reference
-    theory  : why the values are ``within``
+    theory  : reason for the bounds ``within``
     within  : largest |error| [-] of the finest fast size, a Python expression of n; tests assert it
-    sizes   : numbers n of cells across, or of steps; ``fast``: how many of them the fast half runs
+    sizes   : numbers n of cells across, or of steps; ``fast``: number of sizes that --fast runs
     keys    : changes of the scene; a text is a Python expression of n
     let     : constants, numbers or Python expressions, for ``reference`` and ``ours``
-    own     : the reference is of our own finite elements, not public
-    modes   : number of modes, of a scene that is not stepped
+    own     : the reference is from our own finite elements, not published
+    modes   : number of modes of a scene that is not stepped
     """
 
     name: str
@@ -207,7 +207,7 @@ def names_of(scene: Scene, frames: list[msmpetsc.Frame], lattice: Lattice) -> di
     at(probe)     : its positions (T, 3) [m]
     moved(probe)  : its displacements (T, 3) [m] from the start
     peaks(y)      : times and heights (k, 2) of the local maxima of y (T,)
-    stress_at(*x) : stress (6,) [Pa] of the last frame at a place at rest, by a fit of a degree
+    stress_at(*x) : stress (6,) [Pa] of the last frame at a place at rest, by a polynomial fit
     """
     fields = {
         name: np.array([getattr(frame, name) for frame in frames])
@@ -242,7 +242,7 @@ def names_of(scene: Scene, frames: list[msmpetsc.Frame], lattice: Lattice) -> di
 
 
 def maxima(t: np.ndarray, y: np.ndarray) -> Iterator[tuple[float, float]]:
-    """Yield times and heights of local maxima, vertices of parabolas."""
+    """Yield times and heights of local maxima, the vertices of parabolas."""
     for k in 1 + np.flatnonzero((y[1:-1] > y[:-2]) & (y[1:-1] >= y[2:])):
         a, b, c = np.polyfit(t[k - 1 : k + 2] - t[k], y[k - 1 : k + 2], 2)
         yield t[k] - b / (2 * a), c - b**2 / (4 * a)
@@ -251,7 +251,8 @@ def maxima(t: np.ndarray, y: np.ndarray) -> Iterator[tuple[float, float]]:
 def order(case: Case, value: Value, runs: Sequence[Run]) -> float | None:
     """Return the observed order of convergence, None if there is none.
 
-    Three sizes in a geometric row give it by their differences, else two by their errors.
+    Three sizes in a geometric sequence give it by their differences, else two sizes by their
+    errors.
     """
     if len(runs) < 2:
         return None
@@ -316,7 +317,7 @@ def notes(number: int, case: Case) -> Iterator[str]:
 def chart(results: dict[str, tuple[Case, list[Run]]], path: Path) -> None:
     """Draw errors over seconds, and over cells beside the peers' published values.
 
-    Errors below DRAWN stand at it.
+    Errors below DRAWN are drawn at DRAWN.
     """
     import matplotlib
 
@@ -341,7 +342,7 @@ def chart(results: dict[str, tuple[Case, list[Run]]], path: Path) -> None:
             theirs = [max(abs(case.error(case.value[0], x)), DRAWN) for x in peer.values]
             style = {"color": colours[number % 20], "marker": mark, "ms": 4, "ls": ":"}
             size.loglog(peer.cells, theirs, **style, label=f"{case.name}: {peer.name}")
-    # names stand in a column of their own, by the errors at the ends of their lines
+    # names are in a column of their own, at the height of the ends of their lines
     for place, (error, last, name, colour) in enumerate(sorted(ends, key=lambda end: end[0])):
         leader = {"arrowstyle": "-", "color": colour, "lw": 0.5, "alpha": 0.5, "relpos": (0, 0.5)}
         time.annotate(

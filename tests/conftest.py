@@ -1,4 +1,4 @@
-"""Parts that several test files share: real MPI runs, and a small closed body."""
+"""Fixtures and functions that several test files share: MPI runs, small bodies, durations."""
 
 import json
 import os
@@ -21,15 +21,15 @@ ROOT = Path(__file__).parent.parent
 # programs for mpiexec
 WORKERS = ROOT / "tests" / "workers"
 AS_ROOT = {"OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1"}
-# for runs that a command starts by mpiexec within a test
+# for commands that start mpiexec within a test
 os.environ.update(AS_ROOT)
-# waiting ranks yield their core, since ranks outnumber cores
+# waiting ranks yield their core, since there are more ranks than cores
 SHARED_CORES = {"OMPI_MCA_mpi_yield_when_idle": "1"}
-# Open MPI 5 writes a line for each rank about networks that do not pair, IPv4 with
-# IPv6; ranks of one machine need none
+# Open MPI 5 prints a line per rank about networks that do not pair, IPv4 with IPv6;
+# ranks of one machine need none
 ONE_MACHINE = {"OMPI_MCA_btl_tcp_if_include": "lo"}
-# As this process was started: its own MPI, once awake, leaves marks that would confuse
-# a child's. the path by which petsc4py may be found
+# PATHS holds the path by which petsc4py may be found. The environment is that of this
+# process at its start: a running MPI adds variables that would confuse a child.
 PATHS = os.pathsep.join(
     filter(None, (str(ROOT), str(ROOT / "tests" / "helpers"), os.environ.get("PYTHONPATH")))
 )
@@ -42,8 +42,8 @@ ENVIRONMENT = {
     **ONE_MACHINE,
 }
 
-# Seconds that each test file took, all its tests together; scripts/test
-# --record-durations writes them
+# Seconds that all tests of each file took together; scripts/test --record-durations
+# writes them
 DURATIONS = Path(__file__).parent / "durations.json"
 # Seconds of a file up to which its tests are in the smoke run, which takes three
 # minutes in all
@@ -63,7 +63,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Leave out slow tests unless tests are chosen by their file, by -m or by -k."""
+    """Deselect slow tests unless tests are chosen by their file, by -m or by -k."""
     options = config.option
     if (
         config.args_source is not config.ArgsSource.ARGS
@@ -76,7 +76,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the longest files first, and mark the tests of short files as smoke."""
+    """Put the longest files first, and mark the tests of short files as smoke tests."""
     seconds = json.loads(DURATIONS.read_text())
     items.sort(key=lambda item: -seconds.get(file_of(item.nodeid), 0.0))
     for item in items:
@@ -102,7 +102,7 @@ class Recorder:
         self.run[file_of(report.nodeid)] += report.duration
 
     def pytest_sessionfinish(self) -> None:
-        """Write the seconds of all files there are, of files that were not run as they were."""
+        """Write the seconds of all existing files; a file that was not run keeps its old value."""
         seconds = self.seconds | {file: round(took, 1) for file, took in self.run.items()}
         there = {file: seconds[file] for file in sorted(seconds) if Path(file).is_file()}
         lines = json.dumps(there, indent=0)
@@ -110,9 +110,11 @@ class Recorder:
 
 
 def run(ranks: int, *arguments: object, status: int | None = None) -> subprocess.CompletedProcess:
-    """Python with these arguments on so many ranks of a real mpiexec; a hang fails at the time-out.
+    """Run Python with these arguments on so many ranks of a real mpiexec; raise at the time limit.
 
-    All are forked from a process that has imported the package. ``status``: that it must end with.
+    All ranks are forked from a process that has imported the package.
+
+    status : the exit status that the run must have; None for any
     """
     words = [*map(str, arguments)]
     if ranks == 1 and words[:2] in (["-m", "msmpetsc.cli.main"], ["-m", "msmpetsc"]):
@@ -126,13 +128,13 @@ def run(ranks: int, *arguments: object, status: int | None = None) -> subprocess
 def python(
     *words: object, env: Mapping[str, str] = ENVIRONMENT, **options: Any
 ) -> subprocess.CompletedProcess:
-    """A Python that really starts, finished; a hang ends with the time of its test."""
+    """Run Python in a new process to its end; the time limit of the test ends a hang."""
     command = [sys.executable, *map(str, words)]
     return subprocess.run(command, env=env, capture_output=True, text=True, **options)
 
 
 def result_on(ranks: int, scene: Path, *words: object) -> h5py.File:
-    """The result of a scene on so many ranks, which lies beside it."""
+    """Run a scene on so many ranks and return its result, which lies beside the scene."""
     path = scene.with_name(f"{scene.stem}_{ranks}.h5")
     run(ranks, "-m", "msmpetsc.cli.main", "run", scene, "-o", path, *words, status=0)
     return h5py.File(path)
@@ -140,7 +142,7 @@ def result_on(ranks: int, scene: Path, *words: object) -> h5py.File:
 
 @pytest.fixture
 def msmpetsc() -> Run:
-    """msmpetsc(2, "run", "scene.toml") -> the finished command on that many ranks."""
+    """Return the function msmpetsc(2, "run", "scene.toml") that runs a command on two ranks."""
     return lambda ranks, *arguments, **options: run(
         ranks, "-m", "msmpetsc.cli.main", *arguments, **options
     )
@@ -148,7 +150,7 @@ def msmpetsc() -> Run:
 
 @pytest.fixture(scope="session")
 def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A ball of 320 triangles and diameter 2, as a PLY file."""
+    """Return the PLY file of a ball of 320 triangles and diameter 2."""
     path = tmp_path_factory.mktemp("meshes") / "ball.ply"
     trimesh.creation.icosphere(subdivisions=2, radius=1).export(path)
     return path
@@ -156,7 +158,7 @@ def ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def falling_ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The result of a ball that falls and leaps, its surface stored; for reading only."""
+    """Return the result of a ball that falls and leaps, with its surface; do not change it."""
     # this import starts MPI
     from ball_result import write_ball
 
@@ -165,7 +167,7 @@ def falling_ball(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def bar_result(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The result of a bar of two cells; for reading only."""
+    """Return the result of a bar of two cells; do not change it."""
     import small_result
 
     return small_result.write(tmp_path_factory.mktemp("bar") / "bar.h5")
@@ -173,7 +175,7 @@ def bar_result(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def petsc_options():
-    """Set options as the user would, and take them out again."""
+    """Set PETSc options as a user would, and remove them after the test."""
     from petsc4py import PETSc
 
     database, names = PETSc.Options(), []

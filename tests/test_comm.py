@@ -1,4 +1,4 @@
-"""Rows travel, keys are numbered and errors are shared the same on any number of ranks."""
+"""Rows are sent, keys numbered and errors shared in the same way on any number of ranks."""
 
 import pytest
 from conftest import WORKERS, run

@@ -1,6 +1,6 @@
 """Results are read with the core dependencies alone.
 
-An error names the missing package and its extra in a line.
+Otherwise an error names the missing package and its extra in a line.
 """
 
 import os
@@ -19,7 +19,7 @@ from conftest import ROOT, python
 
 from msmpetsc.errors import EXTRAS
 
-# the command of a Python in which these packages are not installed
+# the command of a Python without these packages
 WITHOUT = """
 import runpy, sys
 class Missing:
@@ -86,7 +86,7 @@ def test_exporting_and_comparing_need_the_core_alone(command: str, tmp_path: Pat
 
 
 def in_the_clean(python: Path, *words: object, folder: Path) -> subprocess.CompletedProcess:
-    """Return the finished command of a Python that sees nothing of this one's packages."""
+    """Return the finished command of a Python that sees none of this Python's packages."""
     clean = {
         name: value
         for name, value in os.environ.items()
@@ -131,7 +131,7 @@ def test_an_environment_of_its_own_with_render_alone_draws(tmp_path: Path, ball:
 
 
 BEAM = ROOT / "scenes" / "studies" / "atlas" / "beam.toml"
-# by missing package: the extra that brings it, and a command that needs it
+# by missing package: the extra that installs it, and a command that needs it
 NEEDED = {
     **{
         name: ("run", ["run", BEAM, "-o", "y.h5"])

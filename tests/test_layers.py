@@ -1,4 +1,4 @@
-"""Layers import downwards only, and PETSc, argparse and printing stay where they belong."""
+"""Layers import downwards only, and PETSc, argparse and printing stay in their places."""
 
 import ast
 from collections.abc import Iterator
@@ -34,7 +34,7 @@ NEVER = {
 
 
 def imported(tree: ast.AST) -> Iterator[str]:
-    """Yield the dotted names of all imports, also within functions and TYPE_CHECKING."""
+    """Yield the dotted names of all imports, also in functions and under TYPE_CHECKING."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -64,7 +64,7 @@ def violations(layer: str, source: str) -> list[str]:
 
 
 def prints_to_stdout(node: ast.AST) -> bool:
-    """Writing to a stream that was handed in is allowed: print(..., file=stream)."""
+    """Return whether a call prints to standard output; print(..., file=stream) does not."""
     is_print = (
         isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print"
     )

@@ -48,8 +48,7 @@ SWITCHED = [
 
 
 class Case(NamedTuple):
-    """Tables of a scene, words of the command, how near positions are [sides], and numbers of
-    frames that are equal."""
+    """Tables of a scene, words of the command, tolerance of positions [sides], equal numbers."""
 
     tables: dict[str, Any]
     words: tuple[str, ...] = ()
@@ -64,7 +63,7 @@ def steps(
 
 
 def led(preset: str) -> Case:
-    """Lead nearly all nodes: six of the last corner are free at first, so that a rank has none.
+    """Anchor nearly all nodes: only six in the last corner are free at first, so one rank has none.
 
     The solver is built three times.
     """
@@ -148,7 +147,7 @@ CASES = {
                       "value": {"times": [0, 0.2], "values": [1e3, 5e3]}}],
         "traction": [{"region": half_space(0, 0.49, 1), "value": [0, 0, 50], "stop": 0.1}],
     }),
-    # a plate pushes from below, a second plate reflects nodes of some ranks aside
+    # a plate pushes from below, a second plate reflects nodes of some ranks sideways
     "thin plates": Case({
         "sides": BEAM, "material": SOFT | {"young_modulus": 1e6}, "time": steps(23, 0.002, "bdf2"),
         "obstacle": [
@@ -157,7 +156,7 @@ CASES = {
             box_at([[-0.012, -9, -9], [-0.011, 9, 9]], path=[{"time": 1.0, "by": [3.0, 0, 0]}]),
         ],
     }),
-    # the seventh step has two minima, of 5 and 7 contacts: ranks find either
+    # the seventh step has two minima, of 5 and 7 contacts; ranks find either of them
     "barrier": Case({
         "mesh": {"source": "barrier.ply", "prepare": [{"refine": 0.1}]},
         "material": SOLID | {"damping": 5.0}, "self_contact": {"friction": 0.5},
@@ -166,7 +165,7 @@ CASES = {
         "pin": [{"region": {"box": [[-1, -1, -1], [1, 1, 0.01]]}}], "solver": {"error": 1e-8},
         "time": steps(6, 0.05),
     }, accuracy=1e-6),
-    # obstacles lead the body by more than the barrier's distance
+    # obstacles move the body by more than the barrier's distance
     "squeezed": Case({
         "mesh": {"source": "squeezed.ply", "prepare": [{"refine": 0.1}]}, "material": SOLID,
         "obstacle": [
@@ -179,13 +178,13 @@ CASES = {
     }, accuracy=1e-6),
     **{f"led, {preset}": led(preset) for preset in ("newton", "anderson", "fast-msm")},
 }  # fmt: skip
-# numbers of frames that are compared where they are stored
+# numbers of frames that are compared if they are stored
 FIELDS = {"kinetic", "elastic", "contact", "torque", "reaction", "push", "load", "surface_load"}
 
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[h5py.File]]:
-    """Return the results of each scene on one rank and on two, all made in a process a rank."""
+    """Return the results of each scene on one rank and on two, all from one process a rank."""
     folder, found = tmp_path_factory.mktemp("ranks"), {name: [] for name in CASES}
     for ranks in (1, 2):
         files = [folder / f"{name} {ranks}.h5" for name in CASES]

@@ -1,8 +1,8 @@
-"""README files and pages of the documentation are right: links, commands, scenes, studies, Python.
+"""README files and pages of the documentation: links, commands, scenes, studies and Python hold.
 
-The program itself parses every command. Commands of README.md and of RUN are also run, at the
-small size that SMALLER makes of them. ELSEWHERE lists programs that only other machines have.
-Tables of a scene on a page are run as a scene with the tables that they lack.
+The program itself parses every command. Commands of README.md and of the pages in RUN are also run,
+at the small size that SMALLER gives. ELSEWHERE lists programs that only other machines have. Tables
+of a scene on a page are run together with the tables that they lack.
 """
 
 import os
@@ -70,9 +70,9 @@ RUN = (ROOT / "scripts" / "README.md", *sorted((*START.glob("*.md"), *HOW_TO.glo
 # exit statuses of the commands that were run
 DIFFER = {"compare": (0, 1), "plan": (0, 3)}
 PROGRAM = ("-m", "msmpetsc.cli.main")
-# commands of RUN that are only parsed
+# commands of RUN that are only parsed, not run
 LONG = ("study", "--device cuda")
-# commands that fork runs or start mpiexec, which no fork of a test's may do
+# commands that fork runs or start mpiexec, so they cannot run in a fork
 STARTING = ("plan ", "check ", "doctor")
 
 
@@ -83,7 +83,7 @@ def name_of(path: Path) -> str:
 
 
 def blocks(path: Path, kind: str) -> list[str]:
-    """Return the contents of the blocks of a README or page that are marked as of this kind."""
+    """Return the contents of the code blocks of this kind in a README or page."""
     return re.findall(rf"^```{kind}\n(.*?)^```", path.read_text(), re.M | re.S)
 
 
@@ -102,7 +102,7 @@ WITH_PYTHON = [path for path in TEXTS if blocks(path, "python")]
 
 
 def code_of(text: str) -> list[str]:
-    """Return the lines of a program without indentation, empty lines and comments of their own."""
+    """Return the lines of a program without indentation, empty lines and comment lines."""
     lines = [line.strip() for line in text.splitlines()]
     return [line for line in lines if line and not line.startswith("#")]
 
@@ -154,7 +154,7 @@ def test_commands_are_known(command: str):
         try:
             assert parsed(arguments).command == arguments[0]
         except SystemExit as done:
-            # the page's code prints and ends
+            # --help prints and ends
             assert done.code == 0
         return
     script = ROOT / program
@@ -164,7 +164,7 @@ def test_commands_are_known(command: str):
 
 
 def carried_out(command: str, folder: Path) -> subprocess.CompletedProcess:
-    """Return the finished command, in this folder and small."""
+    """Return the finished command, run in this folder at a small size."""
     for words, small in SMALLER.items():
         command = command.replace(words, small)
     launcher, _, arguments = command.rpartition("msmpetsc ")
@@ -186,7 +186,7 @@ def carry_out(path: Path, folder: Path) -> None:
 
 
 def write_own_scene(folder: Path) -> None:
-    """Write the scene of the page on own meshes, and its body with an end as the group tip."""
+    """Write the scene of the page on own meshes, and its body with one end as the group tip."""
     (folder / "scene.toml").write_text(blocks(START / "own-mesh.md", "toml")[0])
     box = trimesh.creation.box(bounds=[[0, 0, 0], [1, 0.5, 0.5]])
     at_end = (box.vertices[box.faces, 0] == 1).all(axis=1)
@@ -195,9 +195,9 @@ def write_own_scene(folder: Path) -> None:
 
 @pytest.fixture(scope="module")
 def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the clone's scenes, an own scene and body, and the results of the front door.
+    """Return a folder with the clone's scenes, an own scene and body, and results of the README.
 
-    Other README files draw and compare the results of the first page, so it is carried out, too.
+    Other pages draw and compare the results of the first page, so that page is carried out too.
     """
     try:
         locate("bunny_scan", str(ROOT))
@@ -228,7 +228,7 @@ def test_commands_of_the_front_door_run(clone: Path):
 @pytest.mark.slow
 @pytest.mark.parametrize("path", RUN, ids=name_of)
 def test_commands_run(path: Path, clone: Path):
-    # an earlier page may have planned the scene with another integrator
+    # an earlier page may have written another integrator into the scene
     write_own_scene(clone)
     carry_out(path, clone)
 
@@ -258,7 +258,7 @@ STUDIES = HOW_TO / "study.md"
 WITH_TABLES = [path for path in PAGES if blocks(path, "toml") and path != STUDIES]
 # this page names meshes that would be downloaded
 WITH_TABLES.remove(REFERENCE / "every-table.md")
-# tables of the scene that a page's tables change
+# tables of the scene that a page's tables extend
 LACKED = {
     "mesh": {"source": "body.obj"},
     "cages": {"count": 200},
@@ -281,7 +281,7 @@ def test_tables_on_pages_run(path: Path, tmp_path: Path):
         file = tmp_path / f"{number}.toml"
         file.write_text(tomli_w.dumps(scene))
         run(1, *PROGRAM, "run", file, "-o", file.with_suffix(".h5"), *steps, status=0)
-        # for a start from another run of the same lattice
+        # for a scene that starts from another run of the same lattice
         shutil.copy(file.with_suffix(".h5"), tmp_path / "rest.h5")
 
 
@@ -333,7 +333,7 @@ def test_underscores_of_symbols_become_subscripts():
 def test_the_tests_of_cases_are_there():
     """Each test that the table names exists.
 
-    The table gives the start of a name, or all but ``test_``.
+    The table gives a prefix of the name without ``test_``.
     """
     named = re.findall(
         r"\| `([\w/]+\.py)`: (.*) \|$", (ROOT / "tests" / "cases" / "README.md").read_text(), re.M

@@ -1,7 +1,7 @@
-"""Every scene of the paper, and scenes that touch, at about 1,000 cells.
+"""Every scene of the paper, and scenes with self-contact, at about 1,000 cells.
 
-The content of the figure is asserted by numbers from the result file alone. They are bounds, not
-values: a coarse lattice is stiffer than the full lattice, its thin limbs thicker.
+Numbers from the result file show the content of each figure. They are bounds, not values, because a
+coarse lattice is stiffer and its thin limbs are thicker.
 """
 
 import tomllib
@@ -45,7 +45,7 @@ ALL = sorted(path.stem for path in SCENES.glob("*.toml"))
 
 
 class Result:
-    """A finished run: its scene, and all of its arrays."""
+    """A finished run: its scene and all of its arrays."""
 
     def __init__(self, path: Path):
         with h5py.File(path) as file:
@@ -71,40 +71,42 @@ class Result:
         self.height = np.ptp(self.bounds, axis=0)[2]
 
     def zone(self, low: list[float], high: list[float]) -> np.ndarray:
-        """Nodes of a box in parts of the bounding box, (n,) bool."""
+        """Return the mask (n,) of nodes in a box given in shares of the bounding box."""
         u = (self.nodes - self.bounds[0]) / np.ptp(self.bounds, axis=0)
         return ((u >= low) & (u <= high)).all(axis=1)
 
     def region(self, table) -> np.ndarray:
-        """Nodes of a pin's, anchor's or force's region: those that are inside, or where the body is
-        nearest to them. Nodes at slits, which share their place, are left out."""
+        """Return the mask of nodes in a pin's, anchor's or force's region, or nearest to its body.
+
+        Nodes at slits, which share their positions, are left out.
+        """
         distance, _, nearest, _ = igl.signed_distance(self.nodes, *self.body)
         places = np.where(distance[:, None] > 0, nearest, self.nodes)
         _, place, count = np.unique(self.nodes, axis=0, return_inverse=True, return_counts=True)
         return inside(table.region, places, self.bounds) & (count[place.ravel()] == 1)
 
     def mean(self, x: np.ndarray, where: np.ndarray) -> np.ndarray:
-        """Mean by mass over some nodes of (..., n, 3)."""
+        """Return the mean by mass of (..., n, 3) over some nodes."""
         return (
             np.einsum("...nc,n->...c", x[..., where, :], self.mass[where]) / self.mass[where].sum()
         )
 
     def moved(self, frame: int, where: np.ndarray) -> np.ndarray:
-        """Mean displacement of some nodes from rest (3,), in heights of the body."""
+        """Return the mean displacement (3,) of some nodes from rest, in heights of the body."""
         return self.mean(self.q[frame] - self.nodes, where) / self.height
 
     def middle_velocity(self) -> np.ndarray:
-        """(T - 1, 3) [m/s]: of the step that ends at frame 1, 2, ..."""
+        """Return velocities (T - 1, 3) [m/s] of the steps that end at frames 1, 2, ..."""
         return np.diff(self.mean(self.q, np.ones(len(self.mass), bool)), axis=0) / self.time[1]
 
     def inverted(self, frame: int) -> int:
-        """Cells turned inside out: of springs a corner of them, of a solid their mean."""
+        """Return the number of cells inside out, of springs by a corner, of a solid by mean J."""
         return int(self.turned[frame])
 
 
 @pytest.fixture(scope="module")
 def result(tmp_path_factory):
-    """result("heart_pull", ranks=2, "--frames", "3"): each run is made once."""
+    """Return the function result("heart_pull", ranks=2), which runs each scene once."""
     folder = tmp_path_factory.mktemp("scenes")
 
     @cache
@@ -177,7 +179,7 @@ def test_the_armadillos_other_leg_goes_along(result):
 
 
 def knee_angle(run: Result, q: np.ndarray) -> float:
-    """Between thigh and shank of the hind legs, as seen from the side [degrees]."""
+    """Return the angle between thigh and shank of the hind legs, seen from the side [degrees]."""
     zones = (
         ([0, 0.3, 0.45], [1, 0.5, 0.55]),
         ([0, 0.3, 0.3], [1, 0.5, 0.4]),
@@ -208,8 +210,10 @@ def test_the_dragon_is_raised_to_rest_and_pushed_to_rest_and_bends_its_knees(res
 
 
 def error_of_lobes(run: Result) -> float:
-    """The greater of the two lobes' shape errors at the end [m]: thin bronchi join them, and they
-    lean over."""
+    """Return the greater shape error [m] of the two lobes at the end.
+
+    Thin bronchi join the lobes, and they lean over.
+    """
     lobes = (run.zone([x, 0, 0], [x + 0.45, 1, 0.5]) for x in (0, 0.55))
     parts = ((run.q[-1][lobe], run.nodes[lobe], run.mass[lobe]) for lobe in lobes)
     return max(
@@ -236,24 +240,24 @@ def test_the_lung_is_pressed_between_ground_and_plate_and_recovers_with_its_trac
     assert run.moved(-1, body)[2] > -0.07
     # the body folds and comes up again
     assert run.moved(int(np.argmin(low)), tip)[2] < -0.3 < run.moved(-1, tip)[2]
-    # 29 of 999 in the tips of the lobes: springs do not undo a fold
+    # 29 of 999 in the tips of the lobes; springs do not undo a fold
     assert 0 < run.inverted(-1) < 0.06 * len(run.cells)
 
 
 def press_to(share: float) -> list[str]:
-    """Options that let the plate go down to a share of the lung's height."""
+    """Return options by which the plate goes down to a share of the lung's height."""
     by = f"[0, 0, {share * 0.37 - 0.38:.4f}]"
     return ["--set", f"obstacle.1.path.0.by={by}", "--set", f"obstacle.1.path.1.by={by}"]
 
 
 @pytest.mark.slow
 def test_pressed_to_30_percent_springs_invert_cells_for_good_and_a_solid_does_not(result):
-    """Section 6 of the paper: "its deformation effects will begin to distort"."""
+    """Section 6 of the paper says: "its deformation effects will begin to distort"."""
     few = ["--set", "cages.count=500", "--set", "time.duration=2.4", "--set", "solver.error=1e-2"]
     springs = result("lung_press", *press_to(0.3), *few, may_fail=True)
     solid = result("lung_press", *press_to(0.3), *few, "--set", "material.law=neo-hookean")
     assert springs.inverted(-1) > 0.05 * len(springs.cells)
-    # A cell may turn for some frames under the plate
+    # a cell may be inverted for some frames under the plate
     assert solid.turned.max() <= 1 and solid.inverted(-1) == 0
     assert error_of_lobes(solid) < 0.02 * solid.height
 
@@ -278,7 +282,7 @@ def test_the_heart_follows_the_pull_and_returns(result):
 
 
 def test_a_heart_of_tissue_keeps_its_volume_while_it_is_pulled_and_when_it_is_let_go(result):
-    """That of springs, whose Poisson's ratio is 1/4, gains 8% in the pull."""
+    """With springs, whose Poisson's ratio is 1/4, the volume grows by 8% in the pull."""
     run = result("heart_tissue")
     triangles = run.body[1]
     volumes = [
@@ -310,7 +314,7 @@ def test_it_falls_freely_hits_the_ground_and_leaps_and_gains_nothing(result, nam
     assert v[contact - 2] == pytest.approx(gravity[2] * t * (contact - 1), rel=1e-9)
     # the speed is reversed
     assert v[contact:].max() > -0.5 * v[contact - 2]
-    # springs do not resist where a copy of a cell has next to nothing inside
+    # springs do not resist if a copy of a cell has almost nothing inside
     most = 1e-3 * len(run.cells) if name == "brain_fall" else 0
     assert max(run.inverted(frame) for frame in range(contact, len(run.q), 20)) <= most
 
@@ -329,7 +333,7 @@ def test_the_bunnys_ears_move_on_while_its_body_has_stopped(result):
 
 @pytest.mark.slow
 def test_a_bunny_that_falls_on_another_comes_to_rest_on_it(result):
-    """So do the eight of the pile, which take three minutes."""
+    """A bunny that falls on another comes to rest, and its drawn surface crosses nothing."""
     run = result("two_bunnies")
     assert run.contacts[-1] > 0 and run.nearest[-1] > 0
     # the drawn surface is in contact

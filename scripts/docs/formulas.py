@@ -14,9 +14,9 @@ from markdown.util import AtomicString
 
 BASE = r"(?:(?<=(?<!\w)\w)|(?<=(?<!\w)\w['²])|(?<=\|)|(?<=\|²))"
 SUBSCRIPT = BASE + r"_([A-Za-z0-9*]+(?![A-Za-z0-9_])|\([^()]*\))"
-# above the emphasis of Markdown, below its code and links
+# higher priority than Markdown's emphasis, lower than its code and links
 INLINE_PRIORITY = 65
-# above the colours of code, which are for blocks with fences
+# higher priority than the colours of code, which are for blocks with fences
 BLOCK_PRIORITY = 35
 
 
@@ -35,7 +35,7 @@ class Subscripts(InlineProcessor):
 
 
 class Blocks(Treeprocessor):
-    """Turn indented blocks into formulas, their underscores into subscripts."""
+    """Turn indented blocks into formulas, and their underscores into subscripts."""
 
     def run(self, root: Element) -> None:
         for block in root.iter("pre"):

@@ -1,6 +1,6 @@
 """Hooks of mkdocs: put README files and all linked files on the site, and fill in tables.
 
-Pages lie in ``pages/``, README files and results where they are in the tree. A link in any of them
+Pages are in ``pages/``; README files and results stay where they are in the tree. A link in a page
 leads to a file of the tree; on the site it leads to the page of this file.
 """
 

@@ -1,6 +1,6 @@
-"""Tables of the reference pages, each made from the table of the program that it describes.
+"""Tables of the reference pages, each generated from the program's own table.
 
-A page names a table by a line of its own: ``<!-- table: scene_keys -->``.
+A page names a table on a line of its own: ``<!-- table: scene_keys -->``.
 """
 
 import re
@@ -23,7 +23,7 @@ ABOUT = {
 
 
 def cell(text: object) -> str:
-    """Return a text as the content of a cell: no line ends, and no separators but within code."""
+    """Return a text as the content of a cell: without line ends, with | escaped outside code."""
     parts = " ".join(str(text).split()).split("`")
     parts[::2] = [part.replace("|", "\\|") for part in parts[::2]]
     return "`".join(parts)
@@ -37,12 +37,12 @@ def table(head: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
 
 
 def prose(text: str) -> str:
-    """Return a text in which units in brackets are no links."""
+    """Return a text whose bracketed units do not become links."""
     return text.replace("[", "\\[")
 
 
 def code(text: str) -> str:
-    """Return a text as code; nothing for an empty text."""
+    """Return a text as code; an empty text stays empty."""
     return f"`{text}`" if text else ""
 
 
@@ -96,7 +96,7 @@ def options_of_run() -> str:
 
 
 def word_of_option(name: str, option: Option) -> str:
-    """Return an option of a run as a user types it; "" if only Python takes it."""
+    """Return an option of a run as a user types it; "" if only Python has it."""
     value = str(option.keywords.get("metavar") or "|".join(option.keywords.get("choices", ())))
     if option.python:
         return ""
@@ -132,7 +132,7 @@ def dimensions() -> str:
 
 
 def preset_list() -> list[tuple[str, Any]]:
-    """Return names and presets; PETSc is imported here, for the other tables need none."""
+    """Return names and presets; PETSc is imported here, because only these tables need it."""
     from msmpetsc.solve.presets import PRESETS
 
     return list(PRESETS.items())

@@ -1,4 +1,4 @@
-"""Linear systems as PETSc's files: read back they are the step's own, on any number of ranks."""
+"""Exported linear systems equal the systems of the steps, on any number of ranks."""
 
 # ruff: noqa: F811 (fixtures are imported)
 import json
@@ -34,13 +34,13 @@ from msmpetsc.solve.linear.assembled_hessian import assembled, blocks_of
 SOLID = solid_of(1e5, 0.3)
 SWING = {"step": 0.05, "duration": 0.15}
 LINEAR = {"material": {"law": "linear", "young_modulus": 1e5, "density": 1000.0}}
-# of the matrix and of CG, well above rounding and below any term that may be lacking
-# [-]
+# [-] relative tolerance of the matrix and of CG: well above rounding, and below any
+# term of the matrix
 EXACT = 1e-9
 
 
 def read(path: Path, *kinds: type) -> list[PETSc.Object]:
-    """The objects of a file; the block size that lies beside it is no option of later runs."""
+    """Return the PETSc objects in a file; remove the block-size options that PETSc then sets."""
     viewer = PETSc.Viewer().createBinary(str(path), "r", PETSc.COMM_SELF)
     found = [kind().create(PETSc.COMM_SELF).load(viewer) for kind in kinds]
     for name in ("matload_block_size", "vecload_block_size"):
@@ -66,7 +66,7 @@ def matrix(path: Path) -> csr_array:
 
 @pytest.mark.parametrize("law", ["neo-hookean", "linear"])
 def test_a_system_solves_to_the_steps_own_correction(tmp_path: Path, law: str):
-    """With a budget of a single iteration the step ends at x - y."""
+    """With a budget of a single iteration the step ends at x - y, which gives the solution y."""
     material = SOLID if law == "neo-hookean" else LINEAR["material"]
     path = clamped_beam(tmp_path, material=material, time=SWING, solver={"max_iterations": 1})
     result = msmpetsc.run(
@@ -98,7 +98,8 @@ STATIC = {"time": {"step": 1.0, "duration": 1.0, "integrator": "static"}}
 
 LOW = {"region": {"box": [[0, 0, 0], [1, 1, 0.15]], "relative": True}}
 ARMS = {"region": {"box": [[0, 0, 0.3], [1, 1, 1]], "relative": True}, "fix": ["y"]}
-# The sides of a block on rollers: its top is open, and its edge keeps to the sides
+# rollers on the sides of a block whose top is open: the edge of the top stays in the
+# sides
 SIDES = [roller(axis, 0.5 - EPS, 1) for axis in (0, 1)]
 ROLLERS = {"pin": [*map(roller, range(3)), *SIDES]}
 TOP = half_space(2, 0.24, 1)
@@ -120,7 +121,7 @@ BLOWN = {"material": SOLID, "pressure": [{"region": {"box": [[-1] * 3, [1] * 3]}
     ids=["viscous", "friction", "self-contact", "held-self-contact", "static", "rollers", "blown"],
 )
 def test_the_matrix_multiplies_as_the_products_do(tmp_path: Path, tables: dict, bodies):
-    """Viscosity, friction, self-contact, rollers, pressure, a lack of inertia are in the matrix."""
+    """The matrix has all terms: viscosity, friction, self-contact, rollers, pressure."""
     checked = []
 
     def check(step, now, jacobian):
@@ -149,8 +150,8 @@ def test_the_matrix_multiplies_as_the_products_do(tmp_path: Path, tables: dict, 
 
 
 def test_rigid_modes_are_those_of_the_free_body(tmp_path: Path):
-    """H v = M v for a body that falls freely: no energy at rest resists a rigid mode."""
-    # A force that hardly strains the body, so that the step has a system to solve
+    """A body that falls freely has H v = M v for a rigid mode v, because E resists none."""
+    # this force hardly strains the body, but the step has a system to solve
     force = [{"region": {"box": [[-1, -1, -1], [0.1, 1, 1]]}, "total": [1e-6, 0, 0]}]
     path = block_scene(tmp_path, material=SOLID, time=SWING, force=force)
     msmpetsc.run(path, tmp_path / "x.h5", frames=1, export=tmp_path, quiet=True)
@@ -165,8 +166,8 @@ def test_rigid_modes_are_those_of_the_free_body(tmp_path: Path):
 
 @pytest.mark.parametrize("loads", [{}, BLOWN], ids=["weight", "pressure"])
 def test_ranks_write_the_same_system(tmp_path: Path, loads: dict):
-    """Two ranks, with an end on rollers."""
-    # Steps so short that the first guess is free fall on any number of ranks
+    """Two ranks write the system of a serial run; the body has an end on rollers."""
+    # these short steps start from free fall on any number of ranks
     short = {"material": SOLID, "time": {"step": 0.01, "duration": 0.01}} | loads
     path = clamped_beam(tmp_path, pin=[CLAMP, roller(0, 1 - EPS, 1)], **short)
     for ranks in (1, 2):
@@ -192,7 +193,7 @@ def test_ranks_write_the_same_system(tmp_path: Path, loads: dict):
 
 
 def test_a_held_component_has_its_diagonal_alone(tmp_path: Path):
-    """So that the system of a body on rollers, under pressure, has a single solution."""
+    """The diagonal of held components makes the solution of a body on rollers unique."""
     path = block_scene(tmp_path, **STATIC, **ROLLERS, **SQUEEZED)
     result = msmpetsc.run(path, tmp_path / "x.h5", export=tmp_path, quiet=True)
     folder = tmp_path / "step_1"
@@ -249,7 +250,7 @@ def test_an_export_changes_no_frame_and_no_count(tmp_path: Path, integrator: str
 
 
 def test_a_resumed_run_exports_the_steps_that_are_left(tmp_path: Path, caplog):
-    """From the checkpoint of step 20 on."""
+    """The run resumes from the checkpoint of step 20."""
     path = clamped_beam(tmp_path, material=SOLID, time={"step": 0.05, "duration": 1.05})
     first = msmpetsc.run(path, tmp_path / "x.h5", frames=20, checkpoint_every=20, quiet=True)
     longer = {"set": {"time.duration": 1.05}, "force": True}
@@ -259,7 +260,7 @@ def test_a_resumed_run_exports_the_steps_that_are_left(tmp_path: Path, caplog):
 
 
 def test_a_step_without_a_solve_is_told(tmp_path: Path, caplog):
-    """Under the same load a static step is the step before."""
+    """A static step under the load of the step before has no system to solve."""
     path = clamped_beam(tmp_path, time={"step": 1.0, "duration": 2.0, "integrator": "static"})
     msmpetsc.run(path, tmp_path / "x.h5", export=tmp_path / "y", export_steps="1,2")
     assert "no linear system was solved in step 2" in caplog.text

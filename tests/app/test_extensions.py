@@ -1,5 +1,4 @@
-"""Forces and presets of the user's own: by their discrete formulas, in the energy balance, by name,
-installed."""
+"""Forces, obstacles and presets of the user: discrete formulas, energy balance, names, packages."""
 
 import subprocess
 from pathlib import Path
@@ -22,7 +21,7 @@ INTEGRATORS = ("implicit-euler", "bdf2", "verlet")
 
 @pytest.fixture(autouse=True)
 def nothing_stays():
-    """Remove the names that a test registers."""
+    """Remove the names that a test has registered."""
     yield
     for extensions in (FORCES, PRESETS):
         extensions._registered.clear()
@@ -31,7 +30,7 @@ def nothing_stays():
 def flying(
     folder: Path, name: str, steps: int = 10, step: float = STEP, begin: float = 0.0, **tables
 ) -> Path:
-    """A block without gravity that flies upwards, under the force of this name from a time on."""
+    """Return the scene of a block that flies upwards under the named force, without gravity."""
     time = {"step": step, "duration": steps * step, **tables.pop("time", {})}
     own = [{"region": ALL, "function": name, "start": begin}]
     return block_scene(
@@ -40,7 +39,7 @@ def flying(
 
 
 def heights(scene: Path) -> np.ndarray:
-    """Return the path [m] of the block in each frame; these forces do not deform it."""
+    """Return the height [m] of the block in each frame; these forces do not deform the block."""
     positions = np.array([frame.position for frame in msm.frames(scene)])
     assert np.ptp(positions - positions[0], axis=1).max() < 1e-9
     return (positions - positions[0]).mean(axis=1)[:, 2]

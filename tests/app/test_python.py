@@ -1,4 +1,4 @@
-"""Runs from Python: msmpetsc.run writes and prints as the command does, and raises."""
+"""Runs from Python: msmpetsc.run writes and prints as the command does, and raises exceptions."""
 
 import inspect
 import shlex
@@ -139,7 +139,7 @@ FAILING_RANKS = [
 
 @pytest.mark.parametrize(("ranks", "where", "what"), FAILING_RANKS)
 def test_a_failure_of_some_ranks_ends_all_with_its_line_and_status(tmp_path, ranks, where, what):
-    """No other rank waits for them, and neither a lock nor a temporary file is left."""
+    """All ranks end, and neither a lock nor a temporary file is left."""
     scene = block_scene(tmp_path, time={"step": 0.01, "duration": 0.1})
     worker = WORKERS / "alone_worker.py"
     done = run(3, worker, ranks, where, what, "run", scene, "-o", tmp_path / "x.h5")
@@ -154,7 +154,7 @@ def test_a_failure_of_some_ranks_ends_all_with_its_line_and_status(tmp_path, ran
 
 
 def test_ranks_lose_patience_seconds_apart(monkeypatch):
-    """So that the first ends the others before they report the error, too."""
+    """The first rank to lose patience ends all ranks before they also report the error."""
     clock = SimpleNamespace(now=0.0, monotonic=lambda: clock.now)
     clock.sleep = lambda seconds: setattr(clock, "now", clock.now + seconds)
     monkeypatch.setattr(abort, "time", clock)

@@ -1,6 +1,6 @@
-"""Frames without a file: the frames of msmpetsc.run, many times on the same lattice.
+"""Frames without a file equal the frames of msmpetsc.run, also many times on the same lattice.
 
-The runs are from files, tables and scenes.
+Scenes come from files, tables and Scene objects.
 """
 
 import gc
@@ -23,7 +23,7 @@ INTEGRATORS = ("implicit-euler", "bdf2", "verlet")
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    """Return the scene of a block that is held at an end and bends under its weight."""
+    """Return the scene of a block that is held at one end and bends under its weight."""
     return block_scene(tmp_path, **FALL | HELD)
 
 
@@ -49,7 +49,7 @@ def test_tables_and_scenes_are_as_good_as_a_file(
     tables["mesh"]["source"] = tmp_path / "scene.ply"
     tables["gravity"]["acceleration"] = np.array([0, 0, -G])
     tables["material"]["density"] = np.float64(DENSITY)
-    # relative to / there is no mesh; relative to the tables there is
+    # relative to / the mesh is missing; relative to the folder of the tables it exists
     monkeypatch.chdir("/")
     for source in (tables, msm.Scene.of(tables), msm.Scene.load(scene)):
         assert np.array_equal([frame.position for frame in msm.frames(source, 2)], expected)
@@ -138,7 +138,7 @@ def test_a_loop_may_end_early_and_leaves_nothing_behind(scene: Path):
 
 @pytest.mark.parametrize(("end", "status"), [("", 0), ("raise SystemExit(5)", 5)])
 def test_a_process_may_end_while_its_frames_have_not(scene: Path, end: str, status: int):
-    """The frames outlive PETSc, whose objects they hold."""
+    """Frames, which hold PETSc objects, may outlive PETSc."""
     program = f"import sys, msmpetsc; f = msmpetsc.frames(sys.argv[1]); next(f); next(f)\n{end}"
     done = python("-c", program, scene, env=ENVIRONMENT | ALONE)
     assert done.returncode == status and "error" not in done.stderr.lower(), done.stderr
@@ -192,7 +192,7 @@ def test_a_callback_may_change_its_frame(scene: Path, tmp_path: Path):
 
 
 def test_frames_are_those_of_every_third_step_and_the_last(tmp_path: Path):
-    """Nothing is computed for steps left out. The cost of all steps is summed up."""
+    """Skipped steps compute no output, and the costs of all steps are summed."""
     time, solver = {"step": 0.02, "duration": 0.14}, {"preset": "anderson", "error": 1e-6}
     simulation = msm.Simulation(
         block_scene(tmp_path, **FALL | HELD | {"time": time, "solver": solver})

@@ -1,4 +1,4 @@
-"""--device and -mat_type, on a machine that has no GPU or whose GPU is not asked for."""
+"""--device and -mat_type on a machine without a GPU, or with a GPU that the run does not use."""
 
 from pathlib import Path
 from unittest.mock import patch
@@ -49,12 +49,11 @@ def test_a_package_that_is_not_there_is_named():
 
 @pytest.mark.cuda
 def test_a_solver_that_computes_elsewhere_than_the_run_is_refused(tmp_path: Path, petsc_options):
-    """A prefix has a matrix type of its own, for the spare solver of a rescue or of the true
-    error."""
+    """Refuse a -mat_type with a prefix: a spare solver would compute on another device."""
     if device.what_is_missing():
         pytest.skip(device.what_is_missing())
     petsc_options(mat_type="seqaijcusparse")
-    # the sender tells PETSc whether MPI knows GPUs
+    # device.sender tells PETSc whether MPI is GPU-aware
     device.sender(MPI.COMM_SELF)
     with (
         patch("msmpetsc.solve.simulate.sender", lambda comm: lambda array: array),

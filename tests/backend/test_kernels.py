@@ -1,7 +1,4 @@
-"""Compiled kernels are found again by the same sources, in any writable folder.
-
-Changed sources never find them.
-"""
+"""Compiled kernels are found again in any writable folder, but only by the same sources."""
 
 import os
 import resource
@@ -39,7 +36,7 @@ print(caller(Pair(first=3.0, second=5.0)), sum(caller.stats.cache_hits.values())
 
 @pytest.fixture
 def copied(tmp_path: Path) -> Path:
-    """A copy of the package with a kernel of its own, in which no kernel can be kept."""
+    """Return a copy of the package with a kernel of its own, in a folder that stores no kernels."""
     package = tmp_path / "copy" / "msmpetsc"
     shutil.copytree(PACKAGE, package, ignore=shutil.ignore_patterns("__pycache__", "shipped"))
     (package / "__pycache__").touch()
@@ -61,7 +58,7 @@ def chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def environment(package: Path, **variables: object) -> dict[str, str]:
-    """Return variables that keep kernels only in the folders named here."""
+    """Return environment variables that allow kernels only in the given folders."""
     given = {"HOME": NOWHERE, "PYTHONPATH": str(package.parent), **variables}
     others = {
         name: x
@@ -72,7 +69,7 @@ def environment(package: Path, **variables: object) -> dict[str, str]:
 
 
 def called(package: Path, **variables: object) -> tuple[float, int]:
-    """Return the kernel's value in a process of its own, and whether it was found compiled."""
+    """Return the value of the kernel in a new process, and the number of kernels found compiled."""
     done = python(package / "backend" / "caller.py", env=environment(package, **variables))
     assert done.returncode == 0 and not done.stderr, done.stderr
     value, found = done.stdout.split()
@@ -110,8 +107,7 @@ def test_kernels_work_where_nothing_can_be_written(copied: Path):
 def test_changed_sources_never_find_old_kernels(
     copied: Path, tmp_path: Path, name, old, new, value
 ):
-    """Neither a kernel that is called, nor a constant or a named tuple of a file without
-    kernels."""
+    """Changes in a called kernel, in a constant or in a named tuple all cause a new compilation."""
     assert called(copied, NUMBA_CACHE_DIR=tmp_path) == (8.0, 0)
     path = copied / "backend" / f"{name}.py"
     path.write_text(path.read_text().replace(old, new))
@@ -156,7 +152,7 @@ def test_a_disk_that_is_full_keeps_nothing(chosen: Path):
 
 
 def test_kernels_of_a_folder_that_cannot_be_written_are_found(copied: Path, tmp_path: Path):
-    """As in a container whose image has the kernels: missing kernels are kept elsewhere."""
+    """Kernels in a read-only image are used; missing kernels are stored elsewhere."""
     if not os.getuid():
         pytest.skip("root can write to any folder: scripts/bare tries it as a user")
     assert called(copied, NUMBA_CACHE_DIR=tmp_path) == (8.0, 0)

@@ -1,6 +1,6 @@
 """Runs on a GPU, real or pretended (pretend_gpu), give the frames of a CPU.
 
-Arrays of CPU and GPU never mix. Only frames and checkpoints need copies.
+Arrays of CPU and GPU never mix. Only frames and checkpoints are copied to the CPU.
 """
 
 import importlib
@@ -47,7 +47,7 @@ FALL = {
 FLOOR = plane_at(-0.01)
 PRESSES = [{"time": 4 * T, "by": [0.01, 0, -0.05]}]
 PLATE = box_at([[-1, -1, 0.25], [2, 2, 0.5]], response="penalty", friction=0.3, path=PRESSES)
-# thinner than the way of a step
+# thinner than the path of a node in a step
 THIN = box_at([[-1, -1, -0.0041], [2, 2, -0.004]])
 HELD = {"pin": [{"region": {"box": [[0, 0, 0], [0.1, 1, 1]], "relative": True}}]}
 LED = {
@@ -110,7 +110,7 @@ CASES = {
 }  # fmt: skip
 
 
-# bodies struck too hard for the plain iteration
+# bodies that strike too hard for the plain iteration to converge
 FAILING = {
     **CASES["pressed and rubbed"], "time": {"step": T, "duration": 2 * T},
     "solver": {"preset": "fast-msm", "error": 1e-9}, "start": {"velocity": [0.1, 0, -10.0]},
@@ -119,7 +119,7 @@ FAILING = {
 
 @contextmanager
 def real() -> Iterator[None]:
-    """Runs within compute on the GPU that is there."""
+    """Make runs within the context compute on the machine's GPU; skip the test if there is none."""
     lacking = device.what_is_missing()
     if lacking:
         pytest.skip(lacking)
@@ -136,7 +136,7 @@ on_a_gpu = pytest.mark.parametrize(
 
 
 def positions(frames: list[Frame]) -> np.ndarray:
-    """(T, n, 3) [m]"""
+    """Return the positions (T, n, 3) [m] of all frames."""
     return np.array([frame.position for frame in frames])
 
 
@@ -202,8 +202,7 @@ def test_a_step_that_fails_is_rescued(tmp_path: Path, on_gpu):
 def test_positions_come_back_for_frames_that_are_stored_and_no_other_array_is_carried(
     tmp_path: Path, case: str
 ):
-    """Nothing that grows with the body: a few numbers do go to and fro, as where an obstacle has
-    come to."""
+    """No other array of the body's size is copied; a few numbers are, as obstacle positions."""
     scene = load_scene(block_scene(tmp_path, **CASES[case], output={"surface": False, "every": 4}))
     with (
         pretended() as counted,
@@ -235,9 +234,9 @@ SIMULATED = {
     },
     "multigrid": {
         **CASES["pressed and rubbed"], "time": {"step": T, "duration": 2 * T},
-        # its cycle has single precision on a CPU alone
+        # only on a CPU its cycle is in single precision
         "solver": {"preset": "newton-multigrid", "error": 1e-9},
-        # it begins in touch
+        # the body touches the obstacle at the start
         "obstacle": [{**FLOOR, "point": [0, 0, 0.01], "response": "penalty", "friction": 0.3}],
     },
     "verlet": {**CASES["verlet"], "time": {"step": T, "duration": T, "integrator": "verlet"}},
@@ -246,7 +245,7 @@ SIMULATED = {
 
 
 def test_kernels_do_the_same_as_threads(tmp_path: Path):
-    """All of them, in numba's simulator."""
+    """All kernels give the same values as threads in numba's CUDA simulator."""
     paths = [
         block_scene(tmp_path, name=name, **{**case, **SMALLEST}) for name, case in SIMULATED.items()
     ]
@@ -263,7 +262,7 @@ def test_kernels_do_the_same_as_threads(tmp_path: Path):
 
 
 def bodies() -> list[Callable]:
-    """Return the bodies that ``kernel`` was given."""
+    """Return the bodies that ``kernel`` was called with."""
     found = []
     for path in PACKAGE.rglob("*.py"):
         if "\n@kernel\n" in path.read_text():
@@ -275,8 +274,10 @@ def bodies() -> list[Callable]:
 
 
 def test_kernels_compile_for_a_gpu(tmp_path: Path):
-    """To PTX, for the arguments that runs give them, and where there is ptxas to machine code that
-    keeps its variables in registers; it needs no GPU."""
+    """Kernels compile to PTX for the argument types of runs, without a GPU.
+
+    If ptxas is installed, they also compile to machine code without register spills.
+    """
     for package in ("numba_cuda", "cupy"):
         pytest.importorskip(package, reason=f"no {package} here: pip install 'msmpetsc[cuda]'")
     given = {}
@@ -348,7 +349,7 @@ with pretended():
 @pytest.mark.slow
 @pytest.mark.parametrize("ranks", [3, pytest.param(2, marks=pytest.mark.cuda)])
 def test_ranks_agree_on_gpus_too(tmp_path: Path, ranks: int):
-    """Also by the command line: ranks with ghosts, on pretended or real GPUs, against a CPU."""
+    """Runs on ranks with ghosts, with pretended or real GPUs, agree with a run on a CPU."""
     path = block_scene(tmp_path, **CASES["pressed and rubbed"])
     there = ["-c", ON_GPUS, "run"]
     if ranks == 2:

@@ -1,6 +1,6 @@
-"""Paths on the command line that do not exist, are no file, or have the name of another format.
+"""Paths on the command line that are missing, are no files, or have the name of another format.
 
-Each gives a line and status 2. Commands for a single process say so under mpiexec.
+Each ends with a line and status 2, and so do commands for a single process under mpiexec.
 """
 
 import os

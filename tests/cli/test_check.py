@@ -1,4 +1,4 @@
-"""``msmpetsc check``: a scene of the user guarded by its numbers."""
+"""``msmpetsc check`` compares a scene with its stored numbers."""
 
 import json
 from pathlib import Path
@@ -15,7 +15,7 @@ STEPS = 3
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A block on its way down, and its stored numbers."""
+    """Return the scene of a falling block with its stored numbers."""
     folder = tmp_path_factory.mktemp("own")
     fall = {"time": {"step": 0.01, "duration": 1.0}, "gravity": GRAVITY}
     path = block_scene(
@@ -30,7 +30,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def numbers(scene: Path) -> Path:
-    """The file of the numbers, which is put back afterwards."""
+    """Yield the file of stored numbers, and restore it after the test."""
     path = scene.with_suffix(".baseline.json")
     text = path.read_text()
     yield path
@@ -129,7 +129,7 @@ def test_what_cannot_be_checked_is_refused_in_one_line(scene: Path, numbers: Pat
 
 DAMAGE = {
     "scales.m": ("scales", "m", np.inf),
-    # after so many steps any difference would be allowed
+    # after so many steps the tolerance would allow any difference
     "steps": ("run", "steps", 10**9),
     "cells asked for": ("run", "cells asked for", "30, 40"),
     "run.changes": ("run", "changes", "mesh.source=x"),

@@ -1,4 +1,4 @@
-"""The command line: output, refusals, and failures that neither hang nor leave files behind."""
+"""The command line: output, refusals, and failures that neither hang nor leave files."""
 
 import subprocess
 import tomllib
@@ -38,7 +38,7 @@ ball = trimesh.creation.icosphere(subdivisions=2, radius=1)
 
 
 def write_ply(path: Path, points: np.ndarray, triangles: np.ndarray) -> None:
-    """In text, so that NaN and infinity get through."""
+    """Write a PLY file as text, so that NaN and infinity are kept."""
     coordinates = "".join(f"property double {axis}\n" for axis in "xyz")
     head = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n{coordinates}"
     head += f"element face {len(triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
@@ -48,7 +48,7 @@ def write_ply(path: Path, points: np.ndarray, triangles: np.ndarray) -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """scene.toml and its ball, and meshes and scenes with something wrong."""
+    """Return a folder with scene.toml, its ball, and faulty meshes and scenes."""
     folder = tmp_path_factory.mktemp("cli")
     (folder / "scene.toml").write_text(SCENE)
     nan = ball.vertices.copy()
@@ -206,7 +206,7 @@ def sets(*pairs: str) -> list[str]:
     return [word for pair in pairs for word in ("--set", pair)]
 
 
-# by kind of mistake: arguments after the scene, and the words of the error
+# by kind of mistake: arguments after the scene, and words of the error
 BAD = {
     "mesh missing": (mesh("gone.ply"), ["gone.ply"]),
     "mesh NaN": (mesh("nan.ply"), ["nan.ply", "NaN"]),
@@ -227,7 +227,7 @@ REFUSALS = [*((1, name) for name in BAD), *((2, name) for name in list(BAD)[::2]
 
 @pytest.fixture(scope="module")
 def refusals(folder: Path) -> dict[tuple[int, str], Answers]:
-    """Refusals by number of ranks and fault; half of them on two ranks."""
+    """Return the refusals by number of ranks and mistake; half of them run on two ranks."""
     found = {}
     for ranks in (1, 2):
         names = [name for number, name in REFUSALS if number == ranks]
@@ -261,14 +261,14 @@ def test_what_is_odd_but_can_be_simulated_is(scene: Path, tmp_path: Path):
     assert "14 boundary edges" in warning
 
 
-# Failures on the way
+# Failures during a run
 
 
 @pytest.mark.parametrize(("ranks", "preset"), [(1, "newton"), (2, "anderson")])
 def test_a_step_that_does_not_converge_leaves_the_frames_before_it(
     scene: Path, tmp_path: Path, ranks: int, preset: str
 ):
-    """A body at rest until a force sets in at 0.025 s.
+    """A body rests until a force starts at 0.025 s, then its step fails.
 
     Frames 0 to 2 need no iteration, frame 3 several.
     """

@@ -1,4 +1,4 @@
-"""The counts and bytes of inspect against those of a run on R ranks, and the limits of integers."""
+"""Counts and memory of inspect agree with those of a run on R ranks; integers have limits."""
 
 import json
 import re
@@ -27,7 +27,7 @@ SELF = MPI.COMM_SELF
 
 @pytest.fixture
 def scene(ball: Path, tmp_path: Path) -> Path:
-    """A ball of 300 cells, struck by the ground: its steps need iterations."""
+    """Return the scene of a ball of 300 cells that strikes the ground, so steps need iterations."""
     path = tmp_path / "scene.toml"
     shutil.copy(ball, tmp_path / "ball.ply")
     path.write_text("""
@@ -59,7 +59,7 @@ def assert_counts_are_near_those_of_real_ranks(scene: Path, cells: int, rel: flo
 
 
 def test_the_counts_are_near_those_of_real_ranks(scene: Path, tmp_path: Path):
-    """Also of several bodies: each has slabs of its own, along its own longest side."""
+    """The counts agree also for several bodies: each has slabs along its own longest side."""
     assert_counts_are_near_those_of_real_ranks(scene, 3000, 0.01)
     turned = "{ rotate = { axis = [0, 1, 0], degrees = 90 } }"
     (tmp_path / "bar.obj").write_text((ROOT / "scenes/studies/beam.obj").read_text())
@@ -72,7 +72,7 @@ def test_the_counts_are_near_those_of_real_ranks(scene: Path, tmp_path: Path):
 
 
 def test_what_is_scaled_is_near_what_is_counted(scene: Path):
-    """Eight times the cells on 8 ranks: sums to the surface term, ghosts within a quarter."""
+    """With 8 times the cells on 8 ranks sums agree to the surface term, ghosts to a quarter."""
     coarse, fine = (counted(scene, cells, 8) for cells in (4000, 32000))
     scaled = coarse.scaled(fine.cells.sum())
     for name, tolerance in {
@@ -141,8 +141,10 @@ def test_a_body_thinner_than_a_cell_is_told_with_the_cells_that_would_do(
     bending: float | None,
     most: int,
 ):
-    """A strip of 100 x 20 x 1 mm along the grid, on cells of 3.3 to 1 mm: too stiff with springs
-    alone; whether counted or scaled."""
+    """Inspect warns of a strip of 100 x 20 x 1 mm only if cells or springs make it too stiff.
+
+    The strip lies along the grid. Cells of 3.3 to 1 mm are counted or scaled.
+    """
     monkeypatch.setattr("msmpetsc.cli.commands.inspect.MOST_BUILT", most)
     strip = block_scene(
         tmp_path, np.array([0.1, 0.02, 0.001]), cages=cages,
@@ -170,12 +172,12 @@ def test_memory_is_that_of_the_process_not_of_its_parent():
 @pytest.mark.slow
 @pytest.mark.parametrize("law", ["neo-hookean", "linear"])
 def test_the_memory_of_a_run_is_within_a_tenth(tmp_path: Path, capsys, law: str):
-    """A block of 67,000 nodes, in a process of its own."""
+    """The memory of a block of 67,000 nodes is measured in a process of its own."""
     code = (
         "import sys; from msmpetsc import Simulation; from msmpetsc.backend.machine import "
         "peak_memory; list(Simulation(sys.argv[1]).frames()); print(peak_memory())"
     )
-    # The first process compiles kernels, which takes more memory
+    # the first process compiles kernels, which takes more memory
     for cells in (100, 60_000):
         path = block_scene(
             tmp_path, cages={"count": cells}, output={"surface": False},

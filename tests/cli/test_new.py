@@ -1,4 +1,4 @@
-"""``msmpetsc new``: its measures of a mesh, and a scene that runs at once."""
+"""``msmpetsc new`` measures a mesh and writes a scene that runs at once."""
 
 import json
 import os
@@ -148,7 +148,7 @@ def test_an_editable_installation_is_a_path_that_type_checkers_can_follow(tmp_pa
 
 
 def test_commands_that_are_shown_can_be_pasted(tmp_path: Path, capsys):
-    """Names with blanks are quoted."""
+    """Printed commands quote names with blanks."""
     scene, mesh = tmp_path / "my scene.toml", tmp_path / "my box.ply"
     trimesh.creation.box([0.1, 0.2, 0.1]).export(mesh)
     assert status_of("new", scene, "--mesh", mesh) == 0

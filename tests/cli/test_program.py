@@ -1,4 +1,4 @@
-"""The program itself: doctor, examples, quiet and verbose, mistaken words."""
+"""Commands of the program: doctor, examples, quiet and verbose output, mistyped words."""
 
 import json
 import os
@@ -61,8 +61,11 @@ def test_a_mesh_for_a_scene_and_a_scene_for_a_study_name_the_command_that_takes_
 
 
 def test_steps_longer_than_the_slowest_vibration_are_warned_of(tmp_path: Path, capsys):
-    """Bending of a bar of the sides 0.5 and 0.25 m, E = 1e5 Pa: 6.19 L^2 / (d c), c = 10 m/s, is
-    0.62 s."""
+    """A step longer than the slowest vibration gives a warning.
+
+    A bar has sides of 0.5 and 0.25 m and c = 10 m/s. It bends with the period 6.19 L^2 / (d c) =
+    0.62 s.
+    """
     for step, integrator, said in ((0.7, "bdf2", 1), (0.5, "bdf2", 0), (0.7, "verlet", 0)):
         time = {"step": step, "duration": step, "integrator": integrator}
         scene = block_scene(tmp_path, time=time, gravity={"acceleration": [0, 0, -1]})
@@ -76,7 +79,7 @@ def test_steps_longer_than_the_slowest_vibration_are_warned_of(tmp_path: Path, c
 
 
 def test_quiet_says_nothing_and_verbose_when_and_where(tmp_path: Path, capsys):
-    # a solid: two cells of springs across would be told to be thin
+    # a solid, because two cells of springs across would cause a warning
     solid = solid_of(YOUNG)
     scene = str(block_scene(tmp_path, time=ONCE, material=solid))
     assert status_of("run", scene, "-o", tmp_path / "q.h5", "--quiet") == 0
@@ -103,7 +106,7 @@ def test_who_stops_reading_ends_the_command_quietly(command: str):
 
 @pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
 def test_a_run_needs_no_stream(tmp_path: Path, closed: str):
-    """As a service starts it: no file of the run gets the descriptor of a stream."""
+    """No file of a run gets the descriptor of a standard stream that a service has closed."""
     scene = block_scene(tmp_path, time=ONCE)
     words = [sys.executable, "-m", "msmpetsc", "run", str(scene), "-o", str(tmp_path / "x.h5")]
     done = subprocess.run(

@@ -1,4 +1,4 @@
-"""A whole run by the command line: the file alone must prove its course."""
+"""A whole run by the command line satisfies its equations by the data of its file."""
 
 import h5py
 import numpy as np
@@ -12,8 +12,7 @@ GRAVITY = np.array([0, 0, -9.81])
 
 @pytest.fixture(scope="module")
 def fall(tmp_path_factory: pytest.TempPathFactory) -> h5py.File:
-    """The shipped scene at its own time step until it has struck the ground, solved tightly by
-    newton."""
+    """Run the shipped scene at its own time step until it has struck the ground, solved tightly."""
     path = tmp_path_factory.mktemp("runs") / "fall.h5"
     # cells of 23 mm
     words = (
@@ -50,7 +49,7 @@ def test_the_residual_of_every_step_before_contact_from_the_file_alone(fall: h5p
     )
     q, t = fall["frames/position"], fall["frames/time"][1]
     scale = np.linalg.norm(m[:, None] * GRAVITY * t**2)
-    # the ground pushes in the step after these frames
+    # in the step after these frames the ground pushes
     for n in range(frames_before_contact(fall) - 1):
         x, y = q[n + 1], 2 * q[n] - q[max(n - 1, 0)]
         along = x[ends[:, 0]] - x[ends[:, 1]]

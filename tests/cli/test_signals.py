@@ -1,5 +1,4 @@
-"""Runs that are asked to stop, and go on: in this process, and on two ranks under a real
-mpiexec."""
+"""Runs that signals stop continue exactly, also on two ranks of a real mpiexec."""
 
 import os
 import signal
@@ -32,7 +31,7 @@ STATUS = {signal.SIGUSR1: 0, signal.SIGTERM: 143, signal.SIGINT: 130}
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Never stopped."""
+    """Return the result of a run that is never stopped."""
     folder = tmp_path_factory.mktemp("whole")
     assert status_of("run", hanging(folder), "-o", folder / "whole.h5") == 0
     return folder / "whole.h5"
@@ -91,7 +90,7 @@ def test_a_signal_in_the_last_step_comes_too_late(whole: Path, tmp_path, monkeyp
 def test_a_request_to_stop_kills_no_run_outside_its_steps(
     whole: Path, tmp_path, monkeypatch, phase: str
 ):
-    """Before the first step it is heeded at step 0, after the last step it is in vain."""
+    """A signal before the first step stops the run at step 0; after the last it has no effect."""
     path, killed, of_phase = tmp_path / "x.h5", [], getattr(running, phase)
 
     def signalled(*given: object, **more: object) -> object:
@@ -111,7 +110,7 @@ def test_a_request_to_stop_kills_no_run_outside_its_steps(
 
 
 def start(*arguments: object, ranks: int = 1) -> subprocess.Popen:
-    """A run in a process of its own, which has come to its first frame."""
+    """Return a run in a new process that has reached its first frame."""
     launcher = ["mpiexec", "--oversubscribe", "-n", str(ranks)] if ranks > 1 else []
     command = [*launcher, sys.executable, "-m", "msmpetsc.cli.main", "run", *map(str, arguments)]
     process = subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True)
@@ -130,9 +129,9 @@ def wait_until(condition: Callable[[], object]) -> None:
 
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_a_signal_ends_a_step_of_minutes_between_its_iterations(tmp_path, ranks: int):
-    """The step would take 100,000 iterations.
+    """A step of 100,000 iterations ends at the signal.
 
-    A rank that gets the signal takes the second rank along.
+    The rank that gets the signal stops the other rank too.
     """
     path = tmp_path / "x.h5"
     scene = hanging(
@@ -175,7 +174,7 @@ def test_a_signal_ends_a_step_of_minutes_between_its_iterations(tmp_path, ranks:
 
 
 def test_a_second_interrupt_stops_at_once(tmp_path):
-    """Both signals come within a linear solve, which these settings would not end for minutes."""
+    """Both signals come within a linear solve that would take minutes with these settings."""
     path = tmp_path / "x.h5"
     scene = hanging(
         tmp_path, 2, cages={"cell_size": 1 / 48}, solver={"preset": "paper", "error": 1e-9}
@@ -186,9 +185,10 @@ def test_a_second_interrupt_stops_at_once(tmp_path):
     )
     process = start(scene, "-o", path, *endless, "-ksp_monitor", f"ascii:{seen}")
     with process:
-        # an interrupt before this line would end the run
+        # an interrupt before the first monitored iteration would end the run
         wait_until(lambda: seen.exists() and seen.stat().st_size)
-        # signals that arrive together count once: send them until the run has ended
+        # signals that arrive together count once, so send signals until the run has
+        # ended
         wait_until(lambda: process.poll() is not None or process.send_signal(signal.SIGINT))
         told = process.stderr.read()
     assert process.returncode == 130 and "stopped at once" in told

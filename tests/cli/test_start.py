@@ -1,4 +1,4 @@
-"""The start of a command: help and refusals import little, a command imports its own needs."""
+"""The start of a command: help and refusals import little, a command imports only its needs."""
 
 import re
 from pathlib import Path
@@ -33,7 +33,7 @@ try:
 except SystemExit:
     pass
 """
-# Python, its arguments, and modules that it must not import
+# Python code, its arguments, and modules that it must not import
 DOES_WITHOUT = [
     (COMMAND, "--help", SLOW),
     (COMMAND, "run --help", SLOW),

@@ -1,4 +1,4 @@
-"""Nodes that a scene leads and lets go, and regions painted on the surface."""
+"""Nodes that a scene moves and releases, and regions painted on the surface."""
 
 from pathlib import Path
 
@@ -24,7 +24,7 @@ UP = [
 
 
 def place(path: list[dict], time: float) -> np.ndarray:
-    """Return the place on a path at a time."""
+    """Return the position on a path at a time."""
     stops = [{"time": 0, "by": [0, 0, 0]}, *path]
     return np.array(
         [np.interp(time, [s["time"] for s in stops], [s["by"][c] for s in stops]) for c in range(3)]
@@ -45,7 +45,7 @@ def test_anchored_nodes_are_on_their_path_and_the_others_follow(tmp_path: Path):
             frame.position[prescribed], rest[prescribed] + place(UP, frame.time)
         )
     others = (frames[-1].position - rest)[~prescribed]
-    # it swings about the end of the path
+    # the body swings about the end of the path
     assert 0.5 * 0.03 < mass[~prescribed] @ others[:, 2] / mass[~prescribed].sum() < 1.5 * 0.03
     assert np.linalg.norm(others, axis=1).min() > 0
 
@@ -69,8 +69,7 @@ def test_of_two_anchors_on_a_node_the_first_leads_it_and_a_pin_is_stronger_than_
 
 
 def test_let_go_a_body_keeps_the_momentum_that_its_path_gave_it(tmp_path: Path):
-    """Led nodes leave with the path's velocity; without loads nothing changes the momentum from
-    then on."""
+    """Released nodes keep the velocity of the path; without loads the momentum is then constant."""
     stop = 0.06 + 0.5 * T
     model, frames = play(anchored_scene(tmp_path, 15, [{"region": LEFT, "path": UP, "stop": stop}]))
     rest, mass = model.lattice.nodes, model.lattice.mass
@@ -106,7 +105,7 @@ def test_every_node_held_is_refused_until_one_is_free(tmp_path: Path):
 def test_a_wrong_option_is_still_told_where_the_solver_was_built_again(
     tmp_path: Path, petsc_options
 ):
-    """An option that the first solver used is not reported, nor removed with our defaults."""
+    """An option that only the first solver used is not reported, nor removed with our defaults."""
     scene = anchored_scene(tmp_path, 3, [{"region": LEFT, "path": UP, "stop": 0.015}])
     petsc_options(ksp_rtol="1e-8")
     with loop_of(scene) as simulation:
@@ -127,7 +126,7 @@ PAINTED = [3, 17, 3, 101]
 
 @pytest.fixture(scope="module")
 def balls(tmp_path_factory) -> Path:
-    """A folder with a ball's scene, its pin painted, and files of numbers."""
+    """Return a folder with the scene of a ball, its painted pin, and files of point numbers."""
     folder = tmp_path_factory.mktemp("painted")
     ball = trimesh.creation.icosphere(subdivisions=2, radius=1)
     ball.export(folder / "ball.ply")
@@ -150,7 +149,7 @@ def balls(tmp_path_factory) -> Path:
 def corners_of_cells_of(
     points: np.ndarray, low: np.ndarray, cell_size: float
 ) -> set[tuple[int, ...]]:
-    """Return the grid indices of the corners of the cells that hold the points."""
+    """Return the grid indices of the corners of the cells that contain the points."""
     found = set()
     for point in points:
         cell = [int((p - least) // cell_size) for p, least in zip(point, low, strict=True)]
@@ -175,7 +174,7 @@ def test_painted_points_mean_the_corners_of_their_cells(balls: Path):
 
 
 def test_a_point_on_the_far_side_is_in_the_last_cell(tmp_path: Path):
-    """The corners of an aligned block: its far faces belong to its last cells."""
+    """The far faces of a block that lies along the grid belong to its last cells."""
     path = block_scene(
         tmp_path, time={"step": T, "duration": T}, pin=[{"region": {"painted": [0]}}]
     )

@@ -1,4 +1,4 @@
-"""Cells of a solid that a clamp cuts are stiffer, and so are the springs of A."""
+"""Cells of a solid that a clamp cuts become stiffer, and so do the springs of A."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from msmpetsc.elasticity.energy import Elasticity
 
 @pytest.mark.parametrize("free", [0.5, 0.1])
 def test_springs_of_a_solid_bound_its_hessian_at_a_clamp(tmp_path: Path, free: float):
-    """A clamp leaves a share of the first cells free; the bound holds for all displacements."""
+    """The bound holds for all displacements if the clamp leaves a share of the first cells free."""
     pin = {"region": half_space(0, (1 - free) * CELL)}
     given = {"material": solid_of(YOUNG), "pin": [pin], "time": {"step": 0.01, "duration": 0.1}}
     scene = clamped_beam(tmp_path, **given)

@@ -1,4 +1,4 @@
-"""Messages at the start of a run: nodes of tables, tables without effect, odd sizes."""
+"""Messages at the start of a run: nodes of tables, tables without effect, unusual sizes."""
 
 import logging
 import re
@@ -28,7 +28,7 @@ UP, ASIDE = [{"time": 0.05, "by": [0, 0, 0.02]}], [{"time": 0.05, "by": [0.01, 0
 
 
 def build(folder: Path, **tables) -> Model:
-    # two cells of springs are too stiff, and told
+    # two cells of springs across are too stiff and cause a warning
     material = solid_of(YOUNG)
     scene = load_scene(block_scene(folder, **{"time": TIME, "material": material} | tables))
     return build_model(MPI.COMM_SELF, scene)
@@ -36,7 +36,7 @@ def build(folder: Path, **tables) -> Model:
 
 @pytest.fixture
 def heard(caplog):
-    """heard() -> the lines since the last call, by level."""
+    """Return the function heard() -> log messages since its last call, with their levels."""
     caplog.set_level(logging.INFO, "msmpetsc")
 
     def since() -> list[tuple[str, str]]:
@@ -178,13 +178,16 @@ def test_the_first_lines_say_what_a_run_is_of_and_the_last_what_it_left(tmp_path
 
 
 def test_masses_of_mesh_and_lattice_stand_side_by_side(tmp_path, heard):
-    """Cells of 1/8 m around a block of 0.45 x 0.45 x 0.2 m: 4 x 4 x 2 of them, half of them of half
-    the density."""
+    """The log has the masses of mesh and lattice.
+
+    4 x 4 x 2 cells of 1/8 m cover a block of 0.45 x 0.45 x 0.2 m. Half of them have half the
+    density.
+    """
     half = {"region": {"box": [[0, 0, 0], [0.25, 1, 1]]}, "density": 500.0}
     path = block_scene(tmp_path, [0.45, 0.45, 0.2], time=TIME, part=[half])
     for boundary, told in {
         "whole": "closed mesh of 0.0405 m^3, 30.37 kg; lattice of 0.0625 m^3, 46.88 kg",
-        # 0.25 m of 0.45 m are light
+        # 0.25 m of 0.45 m have half the density
         "fill": "closed mesh of 0.0405 m^3, 29.25 kg; lattice of 0.0405 m^3, 29.25 kg",
     }.items():
         scene = load_scene(path, [f'cages.boundary="{boundary}"'])
@@ -194,7 +197,7 @@ def test_masses_of_mesh_and_lattice_stand_side_by_side(tmp_path, heard):
 
 
 def test_ranks_refuse_and_warn_as_one(tmp_path):
-    """Nodes of a region may all lie on the same rank."""
+    """All ranks refuse and warn alike, although the nodes of a region may lie on one rank."""
     block_scene(tmp_path, time=TIME)
     tables = {
         "none is free": {"pin.0.region": LEFT_HALF, "force.0": force(LEFT)},
@@ -218,7 +221,7 @@ def test_ranks_refuse_and_warn_as_one(tmp_path):
 
 
 def test_any_number_of_ranks_tells_the_same_thickness(tmp_path):
-    """A strip of half a cell, turned by 30 degrees."""
+    """The log of a strip of half a cell, turned by 30 degrees, does not depend on the ranks."""
     turned = {"rotate": {"axis": [0, 1, 0], "degrees": 30}}
     solid = solid_of(YOUNG)
     path = block_scene(tmp_path, [1, 0.25, CELL / 2], time=TIME, material=solid)

@@ -1,4 +1,4 @@
-"""Forces that change with time: `total = { times, values }`, straight lines between the values."""
+"""Forces that change with time by a table, `total = { times, values }`, linear in between."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
 
-# [s]: a binary fraction, so that steps end just at the table's times
+# [s]: a binary fraction, so that steps end exactly at the times of the table
 STEP = 1 / 64
 ALL = {"half_space": {"point": [0, 0, 0], "normal": [0, 0, 1]}}
 FOOT = {"half_space": {"point": [0, 0, 0], "normal": [0, 0, -1]}}
@@ -25,7 +25,7 @@ def total(time: float) -> np.ndarray:
 
 
 def pulled(folder: Path, table=TABLE, steps: int = 10, **tables) -> Path:
-    """A block that a force pulls at all its nodes; ``time`` adds to its times."""
+    """Return the scene of a block whose nodes are all pulled; ``time`` adds to its time table."""
     time = {"step": STEP, "duration": steps * STEP} | tables.pop("time", {})
     return block_scene(folder, time=time, force=[{"region": ALL, "total": table}], **tables)
 

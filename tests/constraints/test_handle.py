@@ -1,4 +1,4 @@
-"""Anchors that turn: where their nodes are, and the torque that they report."""
+"""Anchors that turn: the positions of their nodes, and the torque that they report."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ RIGHT = {"box": [[0.49, -1, -1], [1, 1, 1]]}
 
 
 def turned(x: np.ndarray, axis: list[float], angle: float, center: np.ndarray) -> np.ndarray:
-    """Points turned by trimesh's matrix, which is made from a quaternion."""
+    """Return points turned by trimesh's matrix, which is made from a quaternion."""
     return trimesh.transform_points(x, trimesh.transformations.rotation_matrix(angle, axis, center))
 
 
@@ -62,8 +62,7 @@ def test_without_a_center_nodes_turn_about_their_centre_of_mass(tmp_path: Path):
 
 
 def bar(folder: Path, cells: int, turn: float, **tables) -> Path:
-    """A bar of 5 x 1 x 1 along x, clamped on the left, its right end a handle, which turns about
-    x."""
+    """Return the scene of a bar along x, clamped on the left; its right end turns about x."""
     path = [{"time": 1.0, "turn": [turn, 0, 0]}]
     return block_scene(
         folder, sides=np.array([5.0, 1.0, 1.0]), **{"solver": {"error": 1e-12}} | tables,
@@ -75,8 +74,7 @@ def bar(folder: Path, cells: int, turn: float, **tables) -> Path:
 
 
 def test_forces_and_torques_of_a_body_in_balance_add_up(tmp_path: Path):
-    """A weight held by a pin and a handle that has bent and twisted it: moments about any point are
-    none."""
+    """The moments of weight, pin and anchor on a twisted bar sum to zero about any point."""
     gravity = np.array([0.3, -0.5, -2.0])
     scene = bar(tmp_path, 4, 120.0, gravity={"acceleration": gravity.tolist()})
     text = scene.read_text().replace("time = 1.0", "time = 1.0\nby = [-0.3, 0.2, -0.4]")

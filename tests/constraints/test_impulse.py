@@ -1,4 +1,4 @@
-"""A force gives a free body its integral over time, wherever it starts and stops within steps."""
+"""A force gives a free body its time integral, wherever it starts and stops within steps."""
 
 from pathlib import Path
 
@@ -27,7 +27,7 @@ FORCES = {
         {"total": PULL.tolist(), "start": 2 * STEP, "stop": 3 * STEP},
         PULL * STEP,
     ),
-    # 2.5 and 1.4 steps of straight lines, then 0.9 steps of the last value
+    # 2.5 and 1.4 steps of linear change, then 0.9 steps of the last value
     "a table": (
         {"total": TABLE, "stop": 6 * STEP},
         STEP
@@ -48,7 +48,7 @@ TIMES = {
 def test_a_free_body_gets_the_integral_and_no_energy_from_nowhere(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, time: str, force: str
 ):
-    """Half of the nodes are pulled, so that the body swings and turns."""
+    """A pull on half of the nodes makes the body oscillate and turn; its energy is explained."""
     table, integral = FORCES[force]
     scene = block_scene(
         tmp_path,
@@ -56,15 +56,15 @@ def test_a_free_body_gets_the_integral_and_no_energy_from_nowhere(
         time={"step": STEP, "duration": 8 * STEP} | TIMES[time],
     )
     _, frames = play(scene)
-    # Velocities are differences of positions over a step, and chosen steps may be a
-    # thousandth.
+    # Velocities are differences of positions over a step, and chosen steps may be as
+    # short as a thousandth.
     rounding = 1e-9 if "chosen" in time else 1e-11
     for frame in frames[6:]:
         np.testing.assert_allclose(frame.momentum, integral, atol=rounding * np.abs(integral).max())
     if "chosen" in time:
         assert len({frame.steps for frame in frames}) > 1
     assert "nowhere" not in caplog.text
-    # Verlet's energy swings, which the warning allows for.
+    # Verlet's energy oscillates, which the warning allows for.
     if time != "verlet":
         most = max(frame.kinetic + frame.elastic for frame in frames)
         assert sum(frame.energy_gained for frame in frames) < 1e-3 * most
@@ -80,5 +80,5 @@ def test_a_users_force_acts_for_its_share_of_a_step(tmp_path: Path, integrator: 
     )
     model, frames = play(scene)
     mass = model.own_forces[0].mass.sum()
-    # to the error of the steps
+    # up to the step error
     np.testing.assert_allclose(frames[-1].momentum, 2.0 * 1.75 * STEP * mass, rtol=1e-9)

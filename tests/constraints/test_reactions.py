@@ -1,5 +1,4 @@
-"""Forces on a body add up; probes go with it; `msmpetsc series` prints both, the same on any number
-of ranks."""
+"""Reactions balance forces, probes follow the body; `msmpetsc series` prints both."""
 
 import csv
 from itertools import pairwise
@@ -23,7 +22,7 @@ PLATE = plane_at(0.252, -1, response="penalty", friction=0.3)
 
 
 def totals(frame) -> np.ndarray:
-    """Reactions, loads and pushes together (3,) [N]."""
+    """Return the sum (3,) [N] of reactions, loads and pushes."""
     return frame.load + sum(
         rows.sum(axis=0) for rows in (frame.reaction, frame.push) if rows is not None
     )
@@ -33,7 +32,7 @@ def totals(frame) -> np.ndarray:
     "material", [SOLID, {"young_modulus": 1e5, "density": 1000.0}], ids=["solid", "springs"]
 )
 def test_a_reaction_is_the_pull_to_rounding(tmp_path, material):
-    """A pull and the weight, held by two pins that share an edge: the edge's nodes count once."""
+    """Two pins that share an edge hold a pull and the weight: the nodes of the edge count once."""
     scene = block_scene(
         tmp_path, **TIGHT, material=material, time={"integrator": "static"},
         pin=[{"region": BOTTOM}, {"region": EDGE}],
@@ -50,8 +49,7 @@ def test_a_reaction_is_the_pull_to_rounding(tmp_path, material):
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
 @pytest.mark.parametrize(("damping", "retardation_time"), [(0.0, 0.0), (3.0, 0.0), (3.0, 0.02)])
 def test_forces_add_up_to_mass_times_acceleration(tmp_path, integrator, damping, retardation_time):
-    """Lifted against a plate that rubs: of implicit Euler the change of momentum; damping takes its
-    part."""
+    """Reactions, loads and pushes equal the rate of momentum plus damping, with a rough plate."""
     scene = block_scene(
         tmp_path, **TIGHT, anchor=LIFT, obstacle=[PLATE],
         time={"step": 0.01, "duration": 0.03, "integrator": integrator},
@@ -64,7 +62,7 @@ def test_forces_add_up_to_mass_times_acceleration(tmp_path, integrator, damping,
     if integrator == "implicit-euler":
         rates = [(b - a) / 0.01 + damping * b for a, b in pairwise(p)]
     else:
-        # the acceleration of BDF2's third step, which uses two earlier steps
+        # the acceleration of BDF2's third step uses two earlier steps
         rates = [None, None, (3 * p[3] - 4 * p[2] + p[1]) / 0.02 + damping * p[3]]
     for frame, rate in zip(frames[1:], rates, strict=True):
         if rate is not None:
@@ -73,7 +71,7 @@ def test_forces_add_up_to_mass_times_acceleration(tmp_path, integrator, damping,
 
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
 def test_frames_within_a_chosen_step_have_no_inertia_of_its_end(tmp_path, integrator):
-    """A body that flies along with its anchor wants no force, wherever frames lie in long steps."""
+    """A body that flies along with its anchor needs no force, also in frames within long steps."""
     flight = [0.0, 0.0, 2.0]
     scene = block_scene(
         tmp_path, material=SOLID,
@@ -83,15 +81,15 @@ def test_frames_within_a_chosen_step_have_no_inertia_of_its_end(tmp_path, integr
     )  # fmt: skip
     _, frames = play(scene)
     assert sum(frame.steps == 0 for frame in frames[1:]) > 5
-    # in the first step the anchor takes its nodes from rest
+    # in the first step the anchor accelerates its nodes from rest
     for frame in frames[2:]:
         np.testing.assert_allclose(frame.reaction, 0, atol=1e-6)
 
 
 def test_explicit_steps_hang_from_their_pin_with_their_weight_in_the_mean(tmp_path):
-    """Over whole swings the mean reaction is minus the weight.
+    """Over whole oscillations the mean reaction is minus the weight.
 
-    Within a swing it also changes the momentum.
+    Within an oscillation it also changes the momentum.
     """
     scene = block_scene(
         tmp_path, **TIGHT, material=SOLID, pin=[{"region": BOTTOM}],
@@ -140,7 +138,7 @@ def test_a_probe_goes_with_its_cell(tmp_path):
         output={"surface": False, "probe": [{"name": "edge", "point": [CELL, 0.1, 0.0]}]},
     )  # fmt: skip
     _, frames = play(scene)
-    # the probe lies on a held face, so that it follows the anchor
+    # the probe lies on a held face, so it follows the anchor
     assert frames[1].probe == pytest.approx(np.array([[CELL, 0.1, 0.02 / 3]]), abs=1e-12)
     with pytest.raises(InputError, match=r"output\.probe\.0\.point: \(9, 0, 0\) m lies in no cell"):
         play(scene, 'output.probe=[{name="far", point=[9, 0, 0]}]')

@@ -55,7 +55,7 @@ CASES = {
 
 @pytest.mark.parametrize("case", CASES)
 def test_half_a_body_is_half_of_the_whole(tmp_path: Path, case: str):
-    """The plane of symmetry is the half's upper side y = 0.25."""
+    """Half a body moves as the whole; its plane of symmetry is its upper side y = 0.25."""
     tables = SYMMETRIC | CASES[case]
     (model, frames), (of_half, ends) = (
         play(block_scene(tmp_path, sides, name, **tables | {"pin": [CLAMP, *more]}))
@@ -90,7 +90,7 @@ MIDDLE = {"region": {"box": [[-1, 0.25 - EPS, -1], [1, 0.25 + EPS, 1]]}, "fix": 
     ],
 )
 def test_a_plane_of_symmetry_needs_no_roller(tmp_path: Path, integrator: str, floor: dict):
-    """A block that lands on a floor moves as it does with the components held that stay."""
+    """A symmetric block that lands on a floor moves alike with and without rollers."""
     (model, frames), (_, held) = (
         play(
             block_scene(
@@ -109,7 +109,7 @@ def test_a_plane_of_symmetry_needs_no_roller(tmp_path: Path, integrator: str, fl
 
 
 def test_forces_on_a_held_body_that_lies_on_a_barrier_add_up(tmp_path: Path):
-    """A half on a floor: loads, reactions and pushes are the change of momentum."""
+    """For half a body on a floor, loads, reactions and pushes sum to the rate of momentum."""
     floor = box_at([[-1, -1, -0.2], [1, 2, -0.002]], response="barrier")
     scene = block_scene(
         tmp_path, HALF, material=SOLID, pin=[roller(1, 0.25 - EPS, 1)], obstacle=[floor], **DROP,
@@ -149,7 +149,7 @@ def test_plane_strain_has_the_stretches_of_its_closed_form(tmp_path: Path, solve
 
 
 def test_an_anchor_of_a_component_leaves_the_others_free(tmp_path: Path):
-    """A block drawn out along z between smooth grips: uniaxial stress."""
+    """A block pulled along z between smooth grips is under uniaxial stress."""
     lift = {
         "region": half_space(2, 0.25 - EPS, 1),
         "fix": ["z"],
@@ -171,7 +171,7 @@ def test_an_anchor_of_a_component_leaves_the_others_free(tmp_path: Path):
 
 
 def test_a_slab_between_walls_falls_freely(tmp_path: Path):
-    """Held along y alone, its centre of mass has the motion of implicit Euler."""
+    """A slab held along y alone falls as a free body does by implicit Euler."""
     scene = block_scene(
         tmp_path, material=SOLID, pin=[roller(1, 1.0)], solver=MULTIGRID | {"error": 1e-6},
         time={"step": 0.1, "duration": 0.3}, gravity={"acceleration": [1, 2, -9]},
@@ -210,7 +210,7 @@ def test_the_matrix_of_whole_nodes_is_refused(tmp_path: Path):
 
 
 def test_a_plane_strain_body_on_rollers_alone_comes_to_rest_at_once(tmp_path: Path):
-    """A translation along z, which is held everywhere, is no mode without stiffness."""
+    """The solver finds no mode without stiffness, because rollers hold the translation along z."""
     press = {"region": {"box": [[0.5 - EPS, -9, -9], [9, 9, 9]]}, "value": [-2e4, 0.0, 0.0]}
     path = block_scene(
         tmp_path, SIDES,

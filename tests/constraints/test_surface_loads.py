@@ -21,7 +21,7 @@ CORNER = [roller(0), roller(1), roller(2)]
 
 
 def test_a_traction_has_resultant_moment_and_stretch_of_a_bar(tmp_path: Path):
-    """The bar of 1 m is drawn by 1e-3 of Young's modulus; its end is 0.25 m square."""
+    """A bar of 1 x 0.25 x 0.25 m is pulled by 1e-3 of Young's modulus."""
     pull = np.array([100.0, 0, 0])
     scene = block_scene(
         tmp_path, np.array([1.0, 0.25, 0.25]), material=SOLID, time=STATIC, pin=CORNER,
@@ -36,7 +36,7 @@ def test_a_traction_has_resultant_moment_and_stretch_of_a_bar(tmp_path: Path):
     moved = (end.position - rest)[:, 0]
     strain = pull[0] / YOUNG
     middle = np.isclose(rest[:, 0], 0.5)
-    # The law is softer than Hooke's by the strain.
+    # The law is softer than Hooke's by an amount of the order of the strain.
     assert moved[middle].mean() == pytest.approx(0.5 * strain, rel=2e-3)
     assert moved @ share[:, 0] * 16 == pytest.approx(strain, rel=2e-3)
 
@@ -69,7 +69,7 @@ def test_a_closed_pressure_has_the_potential_p_times_volume(tmp_path: Path):
         np.abs(np.cross(q, gradient).sum(axis=0)).max() < 1e-12 * len(rest) * np.abs(gradient).max()
     )
     way = rng.standard_normal(rest.shape)
-    # V is a polynomial of degree 3: differences over a way are exact.
+    # V is a polynomial of degree 3, so differences along a path are exact.
     law.add_gradient(q - way, before)
     law.add_gradient(q + way, after)
     product, other = np.zeros((2, *rest.shape))
@@ -84,7 +84,7 @@ def test_a_closed_pressure_has_the_potential_p_times_volume(tmp_path: Path):
 
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2", "verlet"])
 def test_a_free_body_under_pressure_stays_and_keeps_its_energy(tmp_path: Path, integrator: str):
-    """It breathes: momentum is nil, and the sum of all energies grows by nothing."""
+    """The body oscillates in volume: its momentum is zero, and its total energy does not grow."""
     step = 5e-5 if integrator == "verlet" else 1e-3
     time = {"step": step, "duration": 20 * step, "integrator": integrator}
     _, frames = play(pressed_block(tmp_path, time=time, solver={"error": 1e-8}))
@@ -101,7 +101,7 @@ def test_a_free_body_under_pressure_stays_and_keeps_its_energy(tmp_path: Path, i
 
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
 def test_a_step_takes_the_mean_of_a_pressure(tmp_path: Path, integrator: str):
-    """In the last half of the step, the ramp from 0 to 6e3 Pa: a quarter of 6e3 Pa over all."""
+    """A ramp from 0 to 6e3 Pa in the last half of a step acts as a constant quarter of 6e3 Pa."""
     time = {"step": 0.01, "duration": 0.01, "integrator": integrator}
     ramp = {"value": {"times": [0.005, 0.01], "values": [0, 6e3]}, "start": 0.005}
     (_, ramped), (_, constant) = (
@@ -114,7 +114,7 @@ def test_a_step_takes_the_mean_of_a_pressure(tmp_path: Path, integrator: str):
 
 
 def test_a_half_takes_the_pressure_of_the_whole(tmp_path: Path):
-    """The edge of the open surface of the half may move in the plane of symmetry y = 0.25."""
+    """The edge of the half's open surface may move in the plane of symmetry y = 0.25."""
     tables = {"material": SOLID, "time": STATIC, "solver": {"error": 1e-8}}
     half = SIDES * [1, 0.5, 1]
     clamp = {"region": roller(0)["region"]}
@@ -134,7 +134,7 @@ def test_a_half_takes_the_pressure_of_the_whole(tmp_path: Path):
     rest = model.lattice.nodes
     twins = np.linalg.norm(of_half.lattice.nodes[:, None] - rest, axis=2).argmin(axis=1)
     size = np.abs(frames[-1].position - rest).max()
-    # The meshes have other diagonals, and quadrature is as fine as half a cell.
+    # The meshes have different diagonals, and quadrature is as fine as half a cell.
     assert np.abs(frames[-1].position[twins] - ends[-1].position).max() < 0.08 * size
     (force,), (plane,) = ends[-1].surface_load, ends[-1].reaction[1:]
     assert force[1] == pytest.approx(4e3 * 0.125, rel=0.1)
@@ -173,7 +173,7 @@ def test_bad_input_is_one_line(tmp_path: Path, kind: str, table: dict, message: 
 
 
 def test_a_group_has_its_own_triangles(tmp_path: Path):
-    """The group of an OBJ is the end of a block."""
+    """The named group of an OBJ file is the end of a block."""
     box = trimesh.creation.box(bounds=[[0, 0, 0], SIDES])
     is_end = np.isclose(box.triangles_center[:, 0], SIDES[0])
     write_obj(tmp_path / "grouped.obj", box, {"rest": ~is_end, "end": is_end})
@@ -187,7 +187,7 @@ def test_a_group_has_its_own_triangles(tmp_path: Path):
     assert (ends[:, 0] == SIDES[0]).all()
     message = "traction.0.region.group: the mesh has no group 'and'"
     assert message in command_error("run", scene, "--set", 'traction.0.region.group="and"')
-    # a part that mesh.prepare drops
+    # a part that mesh.prepare removes
     with (tmp_path / "grouped.obj").open("a") as file:
         file.write("v 3 3 3\nv 3.1 3 3\nv 3 3.1 3\ng away\nf 9 10 11\n")
     prepared = 'mesh.prepare=["largest_part"]', 'traction.0.region.group="away"'

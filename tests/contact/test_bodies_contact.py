@@ -1,5 +1,4 @@
-"""Bodies that touch: they do not cross, keep their momentum, come to rest on each other; on three
-ranks, too."""
+"""Bodies in contact do not cross, keep their momentum and come to rest on each other."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -40,7 +39,7 @@ def body(mesh: str, base: list[float], **tables: Any) -> dict[str, Any]:
 
 
 def write(folder: Path, name: str, **tables: Any) -> Path:
-    """A scene file of bodies that touch; ``tables`` are added to it, or take a table's place."""
+    """Write the scene file of bodies in contact; ``tables`` replace or extend its tables."""
     scene = {
         "cages": {"cell_size": CELL},
         "material": SOLID,
@@ -70,7 +69,7 @@ def test_a_block_that_touches_another_at_rest_lies_on_it(folder: Path, meshes: l
 
 
 def test_cubes_side_by_side_in_the_same_plane_of_the_grid_stay_where_they_are(folder: Path):
-    """Without a given distance, the gap must exceed the rounding of a coordinate to a plane."""
+    """The default gap must exceed the rounding of a coordinate to a plane of the grid."""
     bodies = [body("block", [number * SIDE, 0, 0]) for number in range(2)]
     tables = {"time": {"step": 0.01, "duration": 0.03}, "gravity": {"acceleration": [0, 0, 0]}}
     model, frames = play(write(folder, "side_by_side", body=bodies, self_contact={}, **tables))
@@ -97,8 +96,10 @@ def fall(folder: Path, name: str, height: float, **tables: Any) -> Path:
 
 
 def test_a_solid_ball_lands_on_its_lowest_cells_which_are_slivers(folder: Path):
-    """A direction that was bent at the ground led uphill: no line search could go on from the 11th
-    frame."""
+    """The ball lands without recovery.
+
+    A direction bent at the ground once led uphill, and no line search could go on.
+    """
     tables = {"material": SOLID, "time": {"step": 0.01, "duration": 0.15}}
     model, frames = play(fall(folder, "solid", 0.02, **tables))
     assert max(frame.self_contacts for frame in frames) > 20 and frames[-1].substeps == 0
@@ -114,7 +115,7 @@ def test_what_comes_near_on_a_way_that_squeezes_all_is_among_its_pairs(
 ):
     """Boxes around paths leave out the linear part of the motion.
 
-    They still hold the pairs that come near by the linear part alone.
+    The boxes still contain the pairs that come near only by the linear part.
     """
     rng = np.random.default_rng(0)
     plates = [trimesh.creation.box([SIDE, SIDE, 0.01]).subdivide().subdivide() for _ in range(2)]
@@ -140,8 +141,7 @@ def test_what_comes_near_on_a_way_that_squeezes_all_is_among_its_pairs(
 
 
 def test_a_way_is_cut_where_pairs_are_known_at_its_end_alone(folder: Path):
-    """A line search looked behind the block, and the way there is asked for again: once a corner
-    passed through so."""
+    """Collision detection finds a corner on the path even if the pairs at its end are cached."""
     scene = fall(folder, "way", 0.02, time={"step": 0.01, "duration": 0.01})
     model = model_of(scene)
     assert model.collision is not None
@@ -151,7 +151,7 @@ def test_a_way_is_cut_where_pairs_are_known_at_its_end_alone(folder: Path):
     contacts.find(start, with_points=True)
     contacts.find(end, with_points=True)
     free = 0.02 / (0.02 + 2.5 * SIDE)
-    # a tenth of the way that collision detection finds is kept as distance
+    # collision detection keeps a tenth of the collision-free path as distance
     assert 0.75 * free < contacts.collision_free_step(start, end) < free
 
 
@@ -168,7 +168,7 @@ def test_a_ball_that_falls_on_a_block_comes_to_rest_on_it(folder: Path):
     assert frames[-1].kinetic < 0.02 * max(frame.kinetic for frame in frames)
     ball, mass = model.lattice.body == 1, model.lattice.mass
     height = np.array([mass[ball] @ frame.position[ball, 2] for frame in frames]) / mass[ball].sum()
-    # the body stays above, with hardly a dent
+    # the ball stays above the block, which is hardly dented
     assert height[first:].min() > SIDE and height[-1] > SIDE + 0.8 * SIDE / 2
 
 
@@ -193,7 +193,10 @@ def solves(monkeypatch: pytest.MonkeyPatch) -> dict[int, list[str]]:
 def test_the_surface_is_asked_about_around_what_touches_alone(
     folder: Path, solves, monkeypatch, few, asked
 ):
-    """And once more where a step leads into more, as when each iterate is looked at."""
+    """A step uses the pairs around contacts, and is repeated if it leads into further contacts.
+
+    The frames are those of steps that search all pairs at each iterate.
+    """
     monkeypatch.setattr(msmpetsc.contact.surface.pairs, "FEW", few)
     scene = fall(folder, "apart", 0.02, time={"step": 0.01, "duration": 0.15})
     _, frames = play(scene, "solver.error=1e-8")
@@ -239,7 +242,7 @@ def test_what_stores_too_little_to_count_may_be_left_out(folder: Path, monkeypat
 def test_a_step_past_what_it_would_meet_is_solved_with_the_surface(
     folder: Path, solves: dict[int, list[str]]
 ):
-    """Nothing touches at the end of the step; the path there reveals the contact."""
+    """The path reveals a contact, although nothing touches at the end of the step."""
     bodies = [
         body("block", [0, 0, 0]),
         body("ball", [0.02, 0.01, SIDE + 0.02], start={"velocity": [0, 0, -50.0]}),
@@ -249,8 +252,7 @@ def test_a_step_past_what_it_would_meet_is_solved_with_the_surface(
 
 
 def test_a_correction_through_the_surface_says_little_of_the_error(folder: Path):
-    """A ball flies at a block, and its Newton correction through the block, of which the Hessian
-    knows nothing."""
+    """A flying ball's Newton correction leads through a block that the Hessian lacks."""
     bodies = [
         body("block", [0, 0, 0]),
         body("ball", [0, 0, SIDE + 0.002], start={"velocity": [0, 0, -5.0]}),

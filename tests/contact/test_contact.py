@@ -1,5 +1,4 @@
-"""Penalty contact and friction: derivatives, a block at rest, sliding and pressed; obstacles that
-move and reflect."""
+"""Penalty contact and friction: derivatives, blocks at rest, sliding blocks, moving obstacles."""
 
 from pathlib import Path
 
@@ -74,8 +73,7 @@ flat_cases = pytest.mark.parametrize("penalties", CASES.values(), ids=CASES)
 
 
 def pressed(penalties: list[Penalty]) -> tuple[StepContact, np.ndarray, np.ndarray]:
-    """Contact of a step from random q, positions a little away from q, and a direction to go in
-    from there."""
+    """Return the contact of a step from random q, positions near q, and a direction."""
     rng = np.random.default_rng(3)
     q = rng.uniform(-0.9, 0.9, (40, 3))
     contact = StepContact([p.during(q, 0.5, T) for p in penalties], len(q))
@@ -91,7 +89,7 @@ def gradient(contact: StepContact, q: np.ndarray) -> np.ndarray:
 def hessian(
     contact: StepContact, q: np.ndarray, duals: list | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes that any part of it is of, ascending, and the sums of their blocks."""
+    """Return the nodes of all parts of the Hessian, ascending, and the sums of their blocks."""
     total = np.zeros((len(q), 3, 3))
     parts = list(contact.at(q).hessian(duals))
     for nodes, blocks in parts:
@@ -112,8 +110,7 @@ def test_the_gradient_is_the_slope_of_the_change(penalties: list[Penalty]):
 
 @cases
 def test_a_small_change_keeps_its_digits(penalties: list[Penalty]):
-    """Against the first and second derivative: a plain difference of energies has no digit left
-    here."""
+    """The change is its second-order Taylor sum; a difference of energies would have no digits."""
     contact, q, v = pressed(penalties)
     nodes, blocks = hessian(contact, q)
     moved = q + 1e-11 * v
@@ -140,7 +137,7 @@ def test_the_blocks_are_the_slope_of_the_gradient(penalties: list[Penalty]):
 def test_the_blocks_of_a_sphere_lack_its_curvature_alone():
     """The energy 1/2 k d^2 with d = R - r has the block k (n n^T - d / r (I - n n^T)).
 
-    Our block is the first part alone.
+    Our block is only the first term.
     """
     contact, q, v = pressed(BALLS["sphere"])
     step = 1e-7
@@ -174,7 +171,10 @@ def test_what_goes_with_A_is_no_less_than_the_hessian_and_the_bound_no_less_than
 
 @pytest.mark.parametrize("name", ["plane, sticking", "plane, slipping", "box, slipping"])
 def test_the_parabola_of_frictions_secant_nowhere_lies_below_its_potential(name: str):
-    """Nor beyond the kink, as nodes slip back: there that of the true curvature does."""
+    """The parabola bounds the potential, also if nodes slip back beyond the kink.
+
+    The parabola of the true curvature does not.
+    """
     contact, q, v = pressed(CASES[name])
     friction = contact.states[0].friction
     force, back, below = np.zeros_like(q), np.zeros_like(q), []
@@ -193,9 +193,9 @@ def test_the_parabola_of_frictions_secant_nowhere_lies_below_its_potential(name:
 
 @pytest.mark.parametrize("name", ["plane, sticking", "plane, slipping", "box, slipping"])
 def test_duals_of_friction_follow_its_forces(name: str):
-    """Duals after a step are off by the square of the step. Without a step they are the forces.
+    """Duals after a step differ from the forces by the square of the step, and by 0 without a step.
 
-    At agreement the block is the true Hessian. No duals make a block negative.
+    If they agree, the block is the true Hessian. With any duals a block is positive semidefinite.
     """
     contact, q, v = pressed(CASES[name])
     friction = contact.states[0].friction
@@ -227,8 +227,10 @@ def test_a_node_in_a_box_is_pushed_out_through_the_nearest_face(axis: int, side:
 
 
 def test_friction_pulls_along_with_what_moves_up_to_coulombs_limit():
-    """A node 0.2 deep in a plane that goes 0.05 along x in the step; mu N f'(u), f' = 2 s - s^2 at
-    s = u/e < 1."""
+    """A node is 0.2 deep in a plane that moves by 0.05 along x in the step.
+
+    Its friction is mu N f'(u), with f' = 2 s - s^2 for s = u / e < 1.
+    """
     # speeds of 0.5 and 0.2 m/s
     moving = plane([0, 0, 0], [0, 0, 1], SIDEWAYS)
     start = np.array([[0.0, 0, -0.2]])
@@ -241,7 +243,7 @@ def test_friction_pulls_along_with_what_moves_up_to_coulombs_limit():
     }.items():
         contact = StepContact([Penalty(moving, 100.0, 0.3, stick).during(start, 0.3, T)], 1)
         np.testing.assert_allclose(gradient(contact, carried), [[0, 0, -20]], atol=1e-12)
-        # deeper, but the normal force is that of the start
+        # deeper, but the normal force is that at the start
         slipped = carried - [0.05, 0, 0.1]
         np.testing.assert_allclose(
             gradient(contact, slipped), [[-0.3 * 20 * share, 0, -30]], atol=1e-12
@@ -249,10 +251,10 @@ def test_friction_pulls_along_with_what_moves_up_to_coulombs_limit():
 
 
 def test_friction_of_a_step_of_bdf2_goes_by_the_velocity_and_the_depth_that_it_ends_with():
-    """The depth at the end of a step, extrapolated.
+    """The depth at the end of a step is extrapolated.
 
     A node at depths of 0.1 and 0.15 will be 0.2 deep. A node from outside will be at most 0.3 deep.
-    A node on its way out from 0.4 will be out. The plane moves by (0.05, 0.02) a step.
+    A node that rises from 0.4 will be out. The plane moves by (0.05, 0.02) a step.
     """
     moving = plane([0, 0, 0], [0, 0, 1], SIDEWAYS)
     before = np.array([[0.0, 0, -0.1], [0, 0, 0.9], [0, 0, -0.4]])
@@ -294,7 +296,7 @@ def test_a_block_at_rest_sinks_until_the_ground_carries_it(tmp_path: Path, stiff
 
 
 def come_to_rest(tmp_path: Path, young_modulus: float) -> list:
-    """Frames of a die that falls on its corner and comes to rest.
+    """Return the frames of a die that falls on its corner and comes to rest.
 
     The lightest corners weigh less than a millionth of a cell.
     """
@@ -313,21 +315,23 @@ def come_to_rest(tmp_path: Path, young_modulus: float) -> list:
 def test_a_stiff_die_comes_to_rest_though_contact_is_stiffer_than_the_corners_that_touch(
     tmp_path: Path,
 ):
-    """The rounding of F is the rounding of contact."""
+    """The rounding of F is mostly that of contact."""
     assert come_to_rest(tmp_path, 1e10)[-1].kinetic < 1e-3
 
 
 @pytest.mark.slow
 def test_a_line_search_that_finds_only_rounding_ends_the_step(tmp_path: Path):
-    """A die at rest may start a step at its end. One run in twenty failed there."""
+    """A die at rest may start a step at the minimum. A run in twenty failed in this case."""
     for change in range(20, 40):
         assert come_to_rest(tmp_path, 1e10 * (1 - 1e-13 * change))[-1].kinetic < 1e-3
 
 
 @pytest.mark.parametrize("given, error", [({}, 1e-9), ({"friction_speed": 1e-3}, 1e-6)])
 def test_friction_holds_a_block_on_a_gentle_slope(tmp_path: Path, given: dict, error: float):
-    """It gives way by f'(u / e) = 2 s - s^2 = tan / mu = 0.6: s = 0.37, once, and again after 20
-    steps: not in each."""
+    """A block on a slope creeps by s e once in 20 steps, when the slip is reset.
+
+    f'(u / e) = 2 s - s^2 = tan / mu = 0.6 gives s = 0.37.
+    """
     gravity = list(G * np.array([0.3, 0, -1]) / np.hypot(0.3, 1))
     scene = grounded(tmp_path, gravity, 80, 0.02, ROUGH_GROUND | given, solver={"error": error})
     model, frames = play(scene)
@@ -339,7 +343,7 @@ def test_friction_holds_a_block_on_a_gentle_slope(tmp_path: Path, given: dict, e
 
 
 def test_friction_goes_on_from_the_slip_that_the_last_step_ended_with():
-    """By e at most, and the energy that it stores is that which it gives back."""
+    """The slip persists up to e, and the energy that it stores is the energy that it releases."""
     ground, stick = Penalty(plane([0, 0, 0], [0, 0, 1]), 100.0, 0.5, 0.01), 0.01 * T
     start = np.array([[0.0, 0.0, -0.02], [0.0, 0.0, -0.01]])
     first = ground.during(start, T, T)
@@ -360,8 +364,10 @@ def test_friction_goes_on_from_the_slip_that_the_last_step_ended_with():
 def test_a_block_of_a_tenth_holds_below_the_angle_of_friction_and_slides_above_it_at_once(
     tmp_path: Path, beyond: float
 ):
-    """By a degree. Friction of no push in the first step let it go 4.7 mm; then it crept at 0.8
-    mm/s."""
+    """A block holds a degree below the angle of friction and slides a degree above it.
+
+    Friction without a push in the first step once let it slide by 4.7 mm and creep at 0.8 mm/s.
+    """
     angle = np.arctan(0.5) + np.radians(beyond)
     scene = {"cages": {"cell_size": 0.05}, "material": {"young_modulus": 1e6, "density": 1000.0}}
     scene |= {"obstacle": [ROUGH_GROUND], "time": {"step": 0.01, "duration": 1.0}}
@@ -405,7 +411,7 @@ def off_the_slide(model: Model, frames: list[Frame], mu: float, weight: float = 
 
 
 def error_of_a_slide(folder: Path, t: float) -> float:
-    """The ground is soft enough for the steps to resolve how the block sinks in."""
+    """Return the error [m] of a slide on ground so soft that the steps resolve the sinking."""
     mu, time = 0.2, {"step": t, "duration": 0.2, "integrator": "bdf2"}
     ground = GROUND | {"friction": mu, "stiffness": 2e3}
     scene = block_scene(
@@ -418,7 +424,7 @@ def error_of_a_slide(folder: Path, t: float) -> float:
 
 def test_friction_under_a_push_that_changes_is_of_second_order_with_bdf2(tmp_path: Path):
     errors = [error_of_a_slide(tmp_path, t) for t in (0.01, 0.005, 0.0025)]
-    # the normal force of the start gives 3e-3 and orders of 0.9
+    # with the normal force of the start, errors are 3e-3 and orders 0.9
     assert errors[0] < 3e-4
     assert np.log2(errors[0] / errors[1]) > 1.6 and np.log2(errors[1] / errors[2]) > 1.6
 
@@ -439,7 +445,7 @@ SLIDES = {
 
 
 def test_duals_of_friction_save_iterations(tmp_path: Path):
-    """Newton takes 69 in all; with true curvatures alone it is 108, with secants alone 175."""
+    """Newton takes 69 iterations in all, 108 with true curvatures alone, 175 with secants alone."""
     assert sum(frame.iterations for frame in play(block_scene(tmp_path, **SLIDES))[1]) < 75
 
 
@@ -463,7 +469,7 @@ def press(folder: Path, **tables) -> Path:
 
 
 def test_a_plate_presses_a_block_with_E_A_strain_and_lets_it_go(tmp_path: Path):
-    """4% pressed. The contact springs, 9 of k at each end, take their share of the way."""
+    """A plate presses a block by 4%. The contact springs, 9 of k at each end, yield too."""
     model, frames = play(press(tmp_path))
     rest = model.lattice.nodes
     low, high = rest[:, 2] == 0, rest[:, 2] == 0.5
@@ -485,10 +491,11 @@ def test_a_plate_presses_a_block_with_E_A_strain_and_lets_it_go(tmp_path: Path):
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("friction", [0.0, 0.5])
 def test_every_preset_agrees_on_a_pressed_step(tmp_path: Path, preset: str, friction: float):
-    """To the error it declares, |x - x*|_M / |x - y|_M; the exact x* by newton to 1e-11.
+    """Each preset meets the error that it reports, |x - x*|_M / |x* - y|_M.
 
-    ``paper`` stops its CG at 1e-10 of |b|, which stiff contact makes large: with friction it comes
-    to 1.4e-4."""
+    The exact x* is newton's to 1e-11. ``paper`` stops its CG at 1e-10 of |b|, which stiff contact
+    makes large: with friction it reaches 1.4e-4.
+    """
     model, frames = play(press(tmp_path), "time.duration=0.4")
     lattice, obstacle = model.lattice, model.penalties
     q, before = frames[5].position, frames[4].position
@@ -512,7 +519,7 @@ def test_every_preset_agrees_on_a_pressed_step(tmp_path: Path, preset: str, fric
 
 
 def test_a_particle_struck_by_a_moving_plane_leaves_with_twice_its_speed_and_its_own_reversed():
-    """As seen from the plane, at 0.5 m/s, its normal velocity is reversed; e times where e < 1."""
+    """Relative to the plane, at 0.5 m/s, the normal velocity is reversed and multiplied by e."""
     path = Motion.through([Pose(time=2.0, by=(0, 0, 1.0))])
     floor = plane([0, 0, 0], [0, 0, 1], path)
     q, before = np.array([[0.3, 0, 0.2], [0.3, 0, 0.4]]), np.array([[0.2, 0, 0.23], [0.3, 0, 0.4]])
@@ -524,7 +531,7 @@ def test_a_particle_struck_by_a_moving_plane_leaves_with_twice_its_speed_and_its
             (after - after_before)[0] / T, [1.0, 0, v_plane + e * (v_plane - v)]
         )
         np.testing.assert_array_equal((after[1], after_before[1]), (q[1], before[1]))
-    # 0.9 m/s upwards: faster than the plane, so the plane does not hold the node
+    # 0.9 m/s upwards: faster than the plane, so the plane does not push the node
     leaving = q + np.array([0, 0, 0.06])
     np.testing.assert_array_equal(
         Exchange(floor, 1.0).exchanged(leaving[:1], before[:1], StepTaken(0.5, T))[0], leaving[:1]
@@ -555,8 +562,10 @@ def test_an_obstacle_acts_from_start_to_before_stop():
 
 @pytest.mark.parametrize("hold", ["pin", "anchor"])
 def test_held_nodes_are_not_moved_by_what_strikes_them(tmp_path: Path, hold: str):
-    """A plane comes up through the bottom of a block that is held there: struck, it would take the
-    plane's speed."""
+    """Nodes of a pin or an anchor stay when a plane comes up through them.
+
+    A free node would take the speed of the plane.
+    """
     bottom = {"region": {"box": [[0, 0, 0], [0.5, 0.5, 0.01]]}}
     prescribed = bottom | {"path": [{"time": 9.0, "by": [0, 0, 0]}]}
     rising = plane_at(-0.01, path=[{"time": 1.0, "by": [0, 0, 1]}])

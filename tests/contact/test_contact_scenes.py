@@ -1,7 +1,7 @@
-"""Small scenes of bodies that touch: a slope, a stack, a chain, a twisted bar.
+"""Small scenes of bodies in contact: a slope, a stack, a chain, a twisted bar.
 
-Nothing crosses, resting bodies hold, and sliding bodies slide as Coulomb's law says. Frames at rest
-are left out: flat faces have triangles in a common plane, which cross by rounding.
+Nothing crosses, resting bodies hold, and sliding bodies obey Coulomb's law. Frames at rest are not
+examined, because flat faces have coplanar triangles, which cross by rounding.
 """
 
 from pathlib import Path
@@ -20,7 +20,7 @@ G, SIDE = 9.81, 0.1
 
 
 def write(folder: Path, **tables: Any) -> Path:
-    """A scene file; ``tables`` are added to it, or take a table's place."""
+    """Write a scene file; ``tables`` replace or extend its tables."""
     scene = {
         "material": solid_of(1e6),
         "gravity": GRAVITY,
@@ -39,8 +39,10 @@ def box(folder: Path, name: str, sides: list[float], splits: int = 2) -> dict[st
 
 
 def middles(model: Model, frames: list[Frame], bodies: np.ndarray) -> np.ndarray:
-    """Return the mass centres (frames, b, 3) [m] of bodies, by the number of that of each node
-    (n,)."""
+    """Return the centres of mass (frames, b, 3) [m] of bodies.
+
+    bodies : (n,) number of the body of each node
+    """
     mass = model.lattice.mass
     each = [
         mass * (bodies == number) / mass[bodies == number].sum()
@@ -50,8 +52,10 @@ def middles(model: Model, frames: list[Frame], bodies: np.ndarray) -> np.ndarray
 
 
 def test_a_small_pile_takes_few_iterations_a_step_without_a_distance_given(tmp_path):
-    """With 3e-4 of the diagonal for a distance, 0.1 mm in cells of 80 mm, the median was 60
-    iterations."""
+    """The median of the steps in contact is at most 20 iterations.
+
+    With a distance of 3e-4 of the diagonal, 0.1 mm in cells of 80 mm, it was 60.
+    """
     block = box(tmp_path, "block", [0.2] * 3)
     trimesh.creation.icosphere(subdivisions=2, radius=0.11).export(tmp_path / "ball.ply")
     meshes, places = [block, {"source": "ball.ply"}, block], [0.0, 0.05, -0.04]
@@ -80,7 +84,7 @@ def test_a_small_pile_takes_few_iterations_a_step_without_a_distance_given(tmp_p
 
 
 def test_bodies_side_by_side_are_not_thrown_apart_without_a_distance_given(tmp_path):
-    """Their gap of 0.4 mm is less than 1/24 of a cell, which would push them from the start."""
+    """Nothing pushes at the start, although the gap of 0.4 mm is less than 1/24 of a cell."""
     gap, mesh = 0.4e-3, box(tmp_path, "block", [SIDE] * 3)
     scene = write(
         tmp_path,
@@ -100,7 +104,10 @@ def test_bodies_side_by_side_are_not_thrown_apart_without_a_distance_given(tmp_p
 def test_a_block_holds_on_a_slab_a_degree_below_the_angle_of_friction_and_slides_above_it(
     tmp_path, beyond: float
 ):
-    """On a slab of 1.2 m it crept at 6 to 9 mm/s, and had slid 2.3 mm before."""
+    """A block holds or slides on a slab.
+
+    On a slab of 1.2 m it once slid by 2.3 mm, then crept at 6 to 9 mm/s.
+    """
     angle = np.arctan(0.5) + np.radians(beyond)
     slab = box(tmp_path, "slab", [0.4, 0.2, 0.04]) | {"base": [0.1, 0, -0.04]}
     block = box(tmp_path, "block", [SIDE] * 3) | {"base": [0, 0, 0.001]}
@@ -117,7 +124,7 @@ def test_a_block_holds_on_a_slab_a_degree_below_the_angle_of_friction_and_slides
     x = middles(model, frames, 1 * (model.lattice.nodes[:, 2] > -1e-9))[:, 1, 0]
     assert crossings(model, frames[1:]) == 0
     if beyond < 0:
-        # speed [m/s] in 20 steps, in which the friction starts anew once
+        # speed [m/s] over 20 steps, in which the slip is reset once
         assert x[-1] - x[0] < 0.6e-3 and (x[40] - x[20]) / 0.2 < 1e-4
     else:
         mean = (x[40] - 2 * x[30] + x[20]) / 0.01
@@ -125,7 +132,7 @@ def test_a_block_holds_on_a_slab_a_degree_below_the_angle_of_friction_and_slides
 
 
 def stack(folder: Path, duration: float, error: float) -> tuple[Model, list[Frame], np.ndarray]:
-    """Frames of five cubes on each other, and where their middles are (frames, 5, 3) [m]."""
+    """Return the frames of a stack of five cubes, and the cubes' centres (frames, 5, 3) [m]."""
     source = box(folder, "cube", [SIDE] * 3)
     aside = [[0, 0], [0.004, -0.003], [-0.003, 0.004], [0.005, 0], [0, 0.003]]
     bodies = [
@@ -156,9 +163,9 @@ def stack(folder: Path, duration: float, error: float) -> tuple[Model, list[Fram
     ],
 )
 def test_a_stack_of_five_cubes_stands(tmp_path, duration: float, farthest: float, error: float):
-    """It settles, and sways for two seconds.
+    """The stack settles, and sways for two seconds.
 
-    At 0.2 MPa the stack is as high as buckles by its own weight.
+    With cubes of 0.2 MPa the stack would buckle under its own weight.
     """
     model, frames, places = stack(tmp_path, duration, error)
     assert crossings(model, frames[1:]) == 0

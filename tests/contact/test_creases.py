@@ -1,6 +1,6 @@
-"""A surface that meets itself in a crease, with parts nearer at rest than its distance.
+"""A surface that meets itself in a crease, with parts nearer at rest than the barrier's distance.
 
-The parts do not push at rest, do not cross, and are reported truly.
+At rest the parts do not push. They never cross, and pairs that are left out are reported.
 """
 
 from pathlib import Path
@@ -28,8 +28,7 @@ LAW = BarrierLaw(DISTANCE, 100.0, 0.5, 0.01)
 
 
 def grooved(half: float = HALF) -> trimesh.Trimesh:
-    """A block with a groove across its upper side; all its points are within three rings of each
-    other."""
+    """Return a block with a groove across its upper side; all points are within three rings."""
     low, high = LONG / 2 - half, LONG / 2 + half
     profile = [
         [LONG / 2, BOTTOM],
@@ -52,7 +51,7 @@ def grooved(half: float = HALF) -> trimesh.Trimesh:
 
 
 def barrier_of(half: float = HALF) -> tuple[Barrier, np.ndarray, int]:
-    """The barrier of a grooved block, its points (14, 3), and how many pairs push never."""
+    """Return a grooved block's barrier, its points (14, 3), and the number of pairs left out."""
     mesh = grooved(half)
     points = np.array(mesh.vertices)
     barrier = Barrier(Surface(points, np.array(mesh.faces)), LAW, len(points))
@@ -60,7 +59,7 @@ def barrier_of(half: float = HALF) -> tuple[Barrier, np.ndarray, int]:
 
 
 def closed(points: np.ndarray, gap: float) -> np.ndarray:
-    """The points with the groove's upper edges so far apart [m]."""
+    """Return the points with the groove's upper edges at a distance ``gap`` [m]."""
     moved = points.copy()
     upper = np.isclose(np.abs(points[:, 0] - LONG / 2), HALF)
     moved[upper, 0] = LONG / 2 + np.sign(points[upper, 0] - LONG / 2) * gap / 2
@@ -72,10 +71,11 @@ def test_nothing_pushes_in_a_crease_at_rest_and_its_walls_do_not_meet():
     assert len(barrier.creases) > 1 and dropped == 0
     candidates = barrier.candidates(points, 0.0)
     assert all(pairs.empty() for pairs in barrier.contacts(candidates, points))
-    # 0.15 m over a power of 4, at most half of the 0.14 m between the upper edges
+    # the distance of 0.15 m over a power of 4, at most half of the 0.14 m between the
+    # upper edges
     tight = DISTANCE / 4
     level = barrier.distances.index(tight)
-    # pairs of walls push from a smaller distance
+    # pairs of walls push below this smaller distance
     assert barrier.contacts(barrier.creases, closed(points, 1.1 * tight))[level].empty()
     assert not barrier.contacts(barrier.creases, closed(points, 0.99 * tight))[level].empty()
     through = closed(points, -2 * HALF) - points
@@ -126,12 +126,12 @@ def test_walls_are_clear_as_long_as_they_cannot_come_near():
 
 
 def test_walls_that_all_but_touch_are_left_out_and_counted():
-    # the sides are less than a thousandth of the distance apart
+    # the walls are nearer than a thousandth of the distance
     assert barrier_of(half=0.4e-3 * DISTANCE)[2] > 0
 
 
 def scene(folder: Path, **tables) -> Path:
-    """Scene of the block: forces close its groove."""
+    """Return the scene of the block; forces close its groove."""
     half = {"relative": True}
     sides = [[[0, 0, 0.6], [0.2, 1, 1]], [[0.8, 0, 0.6], [1, 1, 1]]]
     path = block_scene(

@@ -1,4 +1,4 @@
-"""Regions, and forces shared out over them."""
+"""Regions select points, and forces are distributed over them."""
 
 import numpy as np
 import pytest
@@ -15,18 +15,18 @@ BOUNDS = np.array([[-1.0, 0.0, 2.0], [3.0, 2.0, 3.0]])
 BOX = {"box": [[0, 0, 0], [1, 1, 0.5]]}
 SPHERE = {"sphere": {"center": [0.5, 0.5, 0.5], "radius": 0.25}}
 HALF_SPACE = {"half_space": {"point": [0, 0, 0.5], "normal": [0, 3, 4]}}
-# region, the points that it holds, and points that it does not hold
+# region, points inside the region, and points outside
 REGIONS = [
     (BOX, [[0, 0, 0], [1, 1, 0.5]], [[0.5, 0.5, 0.51], [-0.01, 0.5, 0.2]]),
-    # x from -1 to 3, y from 0 to 2, z from 2 to 2.5; open outwards at the body's own
-    # bounds in x, in y and below, where cells stick out
+    # x from -1 to 3, y from 0 to 2, z from 2 to 2.5; a side at the body's bounding box
+    # is open, so that protruding cells count
     (
         BOX | {"relative": True},
         [[-1, 0, 2], [3, 2, 2.5], [3.01, 1, 2.2], [0.5, 0.5, 0.2]],
         [[0, 1, 2.51]],
     ),
     (SPHERE, [[0.5, 0.5, 0.75], [0.5, 0.25, 0.5]], [[0.7, 0.7, 0.5]]),
-    # centre at (1, 1, 2.5), the radius a quarter of the longest side, so 1; it stays
+    # centre at (1, 1, 2.5), radius 1, a quarter of the longest side; the region stays
     # round
     (
         SPHERE | {"relative": True},
@@ -34,7 +34,7 @@ REGIONS = [
         [[2.01, 1, 2.5], [1, 1, 3.51]],
     ),
     (HALF_SPACE, [[9, 0, 0.5], [0, 4, -2.5]], [[0, 4, -2.51], [0, -0.1, 0.5]]),
-    # the point is (-1, 0, 2.5), the normal is not scaled
+    # the point is (-1, 0, 2.5); the normal is not scaled
     (HALF_SPACE | {"relative": True}, [[0, 4, -0.5]], [[0, 4, -0.51]]),
 ]
 

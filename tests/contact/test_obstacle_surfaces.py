@@ -55,10 +55,9 @@ def surfaces(model: Model) -> ObstacleSurfaces:
 
 
 def crossed(model: Model, frame: Frame) -> int:
-    """How many edges of bodies cross triangles or are crossed by obstacles' edges, as the model has
-    them at a frame.
+    """Return the number of crossings of edges and triangles of bodies and obstacles.
 
-    Triangles of a face of an obstacle that has turned may seem to cross each other by rounding.
+    Triangles on one face of a turned obstacle may seem to cross each other by rounding.
     """
     obstacles, body = surfaces(model), model.surface
     assert body is not None and frame.surface is not None
@@ -87,17 +86,17 @@ def test_a_block_comes_to_rest_on_a_floor_that_carries_its_weight(tmp_path: Path
     assert model.collision is not None
     assert 0 < last.self_distance < model.collision.law.distance
     assert max(frame.energy_gained for frame in frames) < 1e-3 * last.elastic
-    # Starts beyond the floor took 64.
+    # with starts beyond the floor it took 64
     assert sum(frame.iterations for frame in frames[-10:]) < 32
 
 
 def test_a_plate_presses_a_block_that_is_held_at_its_foot(tmp_path: Path):
-    """A step moves the plate by many times its pushing distance and carries near nodes along."""
+    """A step moves the plate by many times the barrier's distance and carries near nodes along."""
     time = {"step": 0.05, "duration": 0.6}
     model, frames = play(fine_block(tmp_path, time=time, obstacle=[PLATE], pin=FOOT))
     assert not any(crossed(model, frame) for frame in frames)
     last = frames[-1]
-    # upper bound: the barrier's distance takes a little of it
+    # upper bound: the barrier's distance takes a little of the compression
     pressed = 0.05 / SIDES[2]
     force = pressed * SOLID["young_modulus"] * SIDES[0] * SIDES[1]
     # stiffer than a bar, because the foot cannot spread
@@ -156,14 +155,15 @@ def test_a_ball_and_a_mesh_stop_what_falls_on_them(tmp_path: Path, shape: str):
     [
         ("barrier", 20.0, 1e5, 150, 10),
         ("penalty", 20.0, 1e5, 150, 10),
-        # nodes alone let it in by half a cell, and a step takes minutes
+        # with contact of nodes alone it sinks in by half a cell, and a step takes
+        # minutes
         pytest.param("barrier", 60.0, 5e4, 300, 40, marks=pytest.mark.slow),
     ],
 )
 def test_a_ball_pressed_into_a_hole_stays_on_its_rim(
     tmp_path: Path, response: str, pull: float, young: float, cells: int, steps: int
 ):
-    """Which is met by edges: nodes alone let it in."""
+    """The edges of the hole hold the ball; contact of nodes alone lets the ball through."""
     trimesh.creation.annulus(0.045, 0.12, 0.06, sections=24).export(tmp_path / "washer.ply")
     washer = {
         "shape": "mesh",
@@ -189,7 +189,10 @@ def test_a_ball_pressed_into_a_hole_stays_on_its_rim(
 
 
 def test_a_block_that_turns_with_a_table_slips_by_nothing_in_a_step_of_bdf2(tmp_path: Path):
-    """With the table's velocity of the middle of the step, blocks crept out by w^2 r t / 2."""
+    """The slip of a block that turns with a table is zero.
+
+    With the table's velocity at the middle of the step, blocks crept by w^2 r t / 2.
+    """
     t = 0.01
     table = box_at([[-1, -1, -0.2], [1, 1, -2e-4]], response="barrier", center=[0, 0, 0])
     table["path"] = [{"time": 1.0, "turn": [0, 0, 360]}]
@@ -208,8 +211,7 @@ def test_a_block_that_turns_with_a_table_slips_by_nothing_in_a_step_of_bdf2(tmp_
 
 
 def error_of_a_slide(folder: Path, t: float) -> float:
-    """How far [m] X + mu Z is off, as in test_contact: it does not depend on how the push comes and
-    goes."""
+    """Return the error [m] of X + mu Z, as in test_contact; it does not depend on the push."""
     mu = 0.2
     floor = FLOOR | {"box": [[-0.503, -0.507, -0.2], [1.5, 1.1, -1e-4]]}
     scene = block_scene(
@@ -231,7 +233,10 @@ def error_of_a_slide(folder: Path, t: float) -> float:
 
 @pytest.mark.slow
 def test_friction_of_the_surface_is_of_second_order_with_bdf2(tmp_path: Path):
-    """Down to 2e-4 m, which the edges of the floor's triangles make. It was 7.0, 3.7 and 1.9 mm."""
+    """Errors are of second order, down to 2e-4 m, which edges of the floor's triangles cause.
+
+    With the push of the start they were 7.0, 3.7 and 1.9 mm.
+    """
     errors = [error_of_a_slide(tmp_path, t) for t in (0.01, 0.005, 0.0025)]
     assert errors[0] < 2.5e-3 and errors[1] < 0.5 * errors[0] and errors[2] < 0.4 * errors[1]
 
@@ -268,7 +273,7 @@ def test_explicit_steps_refuse_it(tmp_path: Path):
 
 
 def test_a_ball_whose_nodes_have_no_triangle_around_is_built(tmp_path: Path):
-    """Some of its nodes are corners of cells that hold no triangle of the surface."""
+    """Some nodes of the ball are corners of cells that contain no triangle of the surface."""
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.15)
     ball.apply_translation([0, 0, 0.152])
     ball.export(tmp_path / "scene.ply")

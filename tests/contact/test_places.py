@@ -1,4 +1,4 @@
-"""Places of contact count once: aligned meshes, creases, few pairs, friction."""
+"""A place of contact counts once: aligned meshes, creases, few pairs, friction."""
 
 from pathlib import Path
 
@@ -21,7 +21,7 @@ FRICTION = 0.3
 def grid(bent: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Return the points and triangles of a grid over the unit square, folded along x = 1/2.
 
-    bent : slope of the two sides, which make a V
+    bent : slope of the two sides, which form a V
     """
     along = np.arange(CELLS + 1) / CELLS
     points = np.array([[x, y, bent * abs(x - 0.5)] for x in along for y in along])
@@ -33,7 +33,7 @@ def grid(bent: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
 
 
 def plates() -> tuple[Barrier, np.ndarray, np.ndarray]:
-    """Return the barrier of two plates, their points (p, 3) in a plane, and a mask of the upper."""
+    """Return the barrier of two plates, their points (p, 3), and a mask of the upper plate."""
     points, triangles = grid()
     both = np.vstack([points, points + np.array([0, 0, 2 * DHAT])])
     surface = Surface(both, np.vstack([triangles, triangles[:, ::-1] + len(points)]))
@@ -54,7 +54,7 @@ def pushed(barrier: Barrier, points: np.ndarray) -> tuple[float, np.ndarray]:
 def tip_energies(bent: float, tips: np.ndarray) -> np.ndarray:
     """Return the energies (k,) [a_v / 4] of a vertex at positions (k, 3) near a folded grid.
 
-    Candidates are the vertex with each triangle of the grid, and no edges.
+    The candidates are the vertex with each triangle of the grid, and no edges.
     """
     points, triangles = grid(bent)
     away = np.array([[0.5, 0.5, 9.0], [0.6, 0.5, 9.0], [0.5, 0.6, 9.0]])
@@ -78,7 +78,7 @@ def b(distance: np.ndarray) -> np.ndarray:
 
 
 def slid(height: np.ndarray | float) -> np.ndarray:
-    """Return positions (k, 3) on a line over vertices, edges and insides of the grid."""
+    """Return positions (k, 3) on a line over vertices, edges and interiors of the grid."""
     x = np.linspace(0.25, 0.75, 4 * CELLS + 1)
     return np.column_stack([x, 0.25 + 0.5 * (x - 0.25), np.broadcast_to(height, x.shape)])
 
@@ -106,8 +106,8 @@ def test_a_vertex_in_a_concave_crease_has_both_sides_less_their_link():
         np.abs(tips[:, 2] - 0.5 * side) / np.hypot(1, 0.5)
         for side in (np.abs(aside), -np.abs(aside))
     )
-    # The farther side counts if its nearest place is inside it. Else that place is the
-    # link itself.
+    # The farther side counts if its nearest point is inside the side. Else this point
+    # is on the link itself.
     foot = 0.5 * tips[:, 2] > np.abs(aside)
     other = np.where(foot, b(far) - b(np.hypot(aside, tips[:, 2])), 0.0)
     assert tip_energies(0.5, tips) == pytest.approx(b(near) + other, rel=1e-9, abs=1e-15)
@@ -115,7 +115,10 @@ def test_a_vertex_in_a_concave_crease_has_both_sides_less_their_link():
 
 
 def test_the_energy_over_a_vertex_is_that_beside_it():
-    """IPC's sum is five times as large over a vertex, and pushes aligned plates aside."""
+    """The energy is the same over a vertex and beside it.
+
+    IPC's sum is five times as large over a vertex, and pushes aligned plates aside.
+    """
     barrier, points, upper = plates()
     shifts = DHAT * np.array([0.0, 0.1, 0.3, 0.5, 0.7, 1.0, 1.5, 2.0])
     moved = (points + np.where(upper[:, None], [0.9 * s, 0.4 * s, 0.8 * DHAT], 0) for s in shifts)
@@ -125,7 +128,7 @@ def test_the_energy_over_a_vertex_is_that_beside_it():
 
 @pytest.mark.parametrize("seed", range(4))
 def test_crumpled_surfaces_push_from_their_nearest_places_at_least(seed: int):
-    """The gradient is the derivative of the energy, whichever places are linked."""
+    """The gradient is the derivative of the energy for any choice of links."""
     barrier, points, upper = plates()
     random = np.random.default_rng(seed)
     at = (
@@ -150,7 +153,10 @@ def test_crumpled_surfaces_push_from_their_nearest_places_at_least(seed: int):
 
 @pytest.mark.parametrize("narrow", [0.5, 0.2, 0.05, 0.01])
 def test_a_crease_opens(narrow: float):
-    """Links of the mesh would make the energy negative: some neighbours are no candidates."""
+    """The energy is positive, although some neighbours are not among the candidates.
+
+    With links taken from the mesh it would be negative.
+    """
     points, triangles = grid(4.0)
     barrier = Barrier(Surface(points, triangles), BarrierLaw(4 * DHAT, 1.0, 0.0, 0.0), len(points))
     barrier.leave_out_neighbours(points)
@@ -163,7 +169,7 @@ def test_a_crease_opens(narrow: float):
 
 @pytest.mark.parametrize("shift", [0.0, 0.2])
 def test_no_point_is_attracted_where_few_pairs_are_asked_for(shift: float):
-    """A plate touches along a side, then turns flat. Pairs off that side are no candidates."""
+    """A plate touches along a side, then turns flat; pairs beside this side are not candidates."""
     barrier, points, upper = plates()
     points[upper, 0] += shift / CELLS
     heights = 0.5 * DHAT + np.outer(
@@ -180,7 +186,7 @@ def test_no_point_is_attracted_where_few_pairs_are_asked_for(shift: float):
 
 @pytest.mark.parametrize("shift", [0.0, 0.2])
 def test_friction_has_the_push_for_its_limit(shift: float):
-    """No limit is negative, though the weights of links are."""
+    """No friction limit is negative, although links have negative weights."""
     barrier, points, upper = plates()
     points[upper] += [shift / CELLS, 0, 0.5 * DHAT]
     contacts = barrier.contacts(barrier.candidates(points, 0.0), points)
@@ -193,7 +199,7 @@ def test_friction_has_the_push_for_its_limit(shift: float):
 
 
 def test_the_projected_hessian_has_no_negative_part():
-    """The Hessians of links are mostly negative, since their weights are."""
+    """The Hessians of links are mostly negative, since links have negative weights."""
     barrier, points, upper = plates()
     points[upper] += [0.2 / CELLS, 0, 0.5 * DHAT]
     contacts = barrier.contacts(barrier.candidates(points, 0.0), points)
@@ -204,9 +210,9 @@ def test_the_projected_hessian_has_no_negative_part():
 
 
 def test_cards_without_friction_stay_where_they_lie(tmp_path: Path):
-    """Their meshes are equal, so that each vertex lies over a vertex.
+    """Two cards of equal meshes, vertex over vertex, stay in place to 0.05 mm/s.
 
-    IPC's sum of pairs pushes the upper card aside at 3 mm/s. The bound is 0.05 mm/s.
+    IPC's sum over pairs pushes the upper card aside at 3 mm/s.
     """
     card = trimesh.creation.box([0.06, 0.04, 0.006]).subdivide().subdivide()
     card.export(tmp_path / "card.ply")

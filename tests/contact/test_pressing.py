@@ -1,5 +1,4 @@
-"""Obstacles that move by far more than the barrier's distance in a step, with a body between
-them."""
+"""Obstacles that move by many barrier distances in a step, with a body in between."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -31,7 +30,7 @@ WAYS = {
 def pressed(
     folder: Path, plate: dict, steps: int, edge: float = 0.1, **tables
 ) -> tuple[Model, list[Frame]]:
-    """Return the frames of a block on a floor; ``edge`` is the longest of its surface [m]."""
+    """Return the frames of a block on a floor; ``edge`` is the longest edge of its surface [m]."""
     time = {"step": STEP, "duration": STEP * steps}
     solver = {"preset": "newton", "error": 1e-4}
     tables = {
@@ -52,8 +51,7 @@ def pressed(
     ["sheared", *(pytest.param(way, marks=pytest.mark.slow) for way in WAYS if way != "sheared")],
 )
 def test_a_plate_presses_a_free_block_on_a_floor(tmp_path: Path, way: str):
-    """Each of its steps is a hundred times the barrier's distance long; momentum is that of all
-    forces."""
+    """Each step of the plate is 100 barrier distances long; forces sum to the rate of momentum."""
     steps = 3
     plate = PLATE | {"center": CENTER, "path": [{"time": STEP * steps, **WAYS[way]}]}
     model, frames = pressed(tmp_path, plate, steps, self_contact={"friction": 0.4})
@@ -69,8 +67,7 @@ def test_a_plate_presses_a_free_block_on_a_floor(tmp_path: Path, way: str):
 
 @pytest.mark.slow
 def test_a_ring_is_pushed_down_a_cone(tmp_path: Path):
-    """The cone widens it; the plate that pushes goes on by eighty times the barrier's distance in a
-    step."""
+    """A cone widens the ring; the plate moves on by 80 barrier distances in a step."""
     ring = trimesh.creation.annulus(
         r_min=0.1, r_max=0.16, height=0.06, sections=24
     ).subdivide_to_size(0.06)
@@ -101,8 +98,7 @@ def test_a_ring_is_pushed_down_a_cone(tmp_path: Path):
 
 @pytest.mark.slow
 def test_a_paddle_that_goes_by_half_a_ball_a_step_hits_it(tmp_path: Path):
-    """Its point goes at three times the speed of sound of the ball, of which light nodes swing far
-    out."""
+    """The paddle's tip has three times the ball's speed of sound, so light nodes swing far out."""
     ball = trimesh.creation.icosphere(1, 0.1)
     ball.apply_translation([0.2, 0.14, 0])
     paddle = box_at([[-0.3, -0.01, -0.2], [0.3, 0.01, 0.2]], center=[0, 0, 0])

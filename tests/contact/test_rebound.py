@@ -1,6 +1,6 @@
 """A body that strikes an obstacle and leaps off gains no energy.
 
-Its energy budget and the sum of its frames show it.
+Both the energy balance and the sums of energies of the frames show this.
 """
 
 from pathlib import Path
@@ -17,7 +17,7 @@ FALL = {"gravity": GRAVITY, "start": {"velocity": [0, 0, -2.0]}}
 
 
 def rise(frames) -> float:
-    """The most that the total energy ever rises by, over the most kinetic and elastic energy."""
+    """Return the greatest rise of the total energy over the greatest kinetic and elastic energy."""
     total = totals(frames)
     has = max(frame.kinetic + frame.elastic for frame in frames)
     return float((total - np.minimum.accumulate(total)).max() / has)
@@ -26,14 +26,14 @@ def rise(frames) -> float:
 @pytest.mark.parametrize("restitution", [1.0, 0.5])
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2", "verlet"])
 def test_a_ball_gains_nothing(tmp_path: Path, integrator: str, restitution: float):
-    """Verlet's energy swings, at the limit of its substeps by 0.7% here, and comes back."""
+    """A ball gains no energy. Verlet's energy oscillates by 0.7% here, at its stability limit."""
     time = {"step": 0.004, "duration": 0.2, "integrator": integrator}
     _, frames = play(
         ball(tmp_path, time=time, obstacle=[PLANE | {"restitution": restitution}], **FALL)
     )
     share = 1e-2 if integrator == "verlet" else 1e-3
     assert rise(frames) < share
-    # the budget of Verlet also counts oscillations
+    # Verlet's balance also counts oscillations
     if integrator != "verlet":
         assert sum(frame.energy_gained for frame in frames) < share * frames[0].kinetic
     # the body leaves the ground
@@ -50,10 +50,10 @@ GROUNDS = {
 @pytest.mark.parametrize(
     ("response", "step", "speed", "size", "cells"),
     [
-        # pressed at the end of the step that would gain
+        # an obstacle presses at the end of the step that would gain energy
         ("penalty", 0.005, 2.5, [0.25, 0.125, 0.0125], 50),
         ("penalty", 0.0025, 2.5, [0.25, 0.125, 0.0125], 50),
-        # has left the ground by then
+        # the plate has left the ground by then
         ("penalty", 0.005, 3.0, [0.25, 0.125, 0.0125], 50),
         ("barrier", 0.005, 3.0, [0.3, 0.1, 0.01], 300),
     ],
@@ -79,7 +79,7 @@ def test_bdf2_does_not_give_back_what_the_impact_of_a_soft_plate_took(
 
 
 def test_bdf2_bounces_off_a_moving_ground_as_off_one_at_rest(tmp_path: Path):
-    """An impact comes after its step, so its work is no gain of the step."""
+    """The work of an impact counts in the next step, so the energy balance shows no gain."""
     flights = []
     for wind in np.zeros(3), np.array([0.0, 0.0, -20.0]):
         ground = plane_at(-0.05, restitution=0.4) | {"normal": [0.1, 0, 1]}
@@ -97,7 +97,7 @@ def test_bdf2_bounces_off_a_moving_ground_as_off_one_at_rest(tmp_path: Path):
 
 
 def test_nodes_that_reach_the_ground_stop_together(tmp_path: Path, monkeypatch):
-    """Node by node, they take two to three times the iterations."""
+    """If nodes stop one by one, iterations double or triple."""
 
     def iterations() -> int:
         fall = FALL | {

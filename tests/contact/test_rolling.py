@@ -16,7 +16,7 @@ G, R, SLOPE, FRICTION = 9.81, 0.1, 0.3, 0.5
 
 
 class Rolled(NamedTuple):
-    """Way over that of a ball of 2/5 m R^2, way over angle and R, lumped inertia over m R^2."""
+    """Ratios of a run: path to the exact path, path to angle times R, lumped inertia to m R^2."""
 
     way: float
     radius: float
@@ -24,7 +24,7 @@ class Rolled(NamedTuple):
 
 
 def rolled(cells: int, response: str, step: float = 2.5e-3, duration: float = 0.5) -> Rolled:
-    """Run a ball with ``cells`` cells a radius, seen along the slope."""
+    """Run a ball with ``cells`` cells per radius, in the frame of the slope; return its ratios."""
     ball = trimesh.creation.icosphere(4, R)
     ball.vertices *= (4 / 3 * np.pi * R**3 / ball.volume) ** (1 / 3)
     ball.vertices += [0, 0, -1e-5 - ball.vertices[:, 2].min()]
@@ -66,9 +66,9 @@ def rolled(cells: int, response: str, step: float = 2.5e-3, duration: float = 0.
 
 @pytest.mark.slow
 def test_a_ball_rolls_on_its_surface():
-    """With the barrier, which touches with the surface; the lattice has the inertia of its nodes.
+    """With a barrier the ball rolls on its surface with the lumped inertia of the lattice.
 
-    Steps of 5 ms are 1% of the time, and cells of half the radius dent by 0.2% of it.
+    Steps of 5 ms are 1% of the time, and the ball is dented by 0.2% of its radius.
     """
     ball = rolled(2, "barrier", step=5e-3)
     assert ball.radius == pytest.approx(1, abs=0.01)

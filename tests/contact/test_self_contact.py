@@ -1,4 +1,4 @@
-"""A surface that meets itself: derivatives, momentum, no crossing on one rank and three.
+"""A surface that meets itself: derivatives, momentum, no crossing on one rank or three.
 
 Also resumed runs, meshes that cut themselves, and refusals.
 """
@@ -37,7 +37,7 @@ def model(tmp_path_factory) -> Model:
 
 
 def closed(model: Model) -> np.ndarray:
-    """Nodes (n, 3) of the tube with its arms bent together, so that their ends are GAP apart."""
+    """Return the nodes (n, 3) of the tube with its arms bent until their ends are GAP apart."""
     q = model.lattice.nodes.copy()
     end = np.clip(q[:, 2] / ARM, 0, None) ** 2
     q[:, 0] -= np.sign(q[:, 0]) * (HALF - RADIUS - GAP / 2) * end
@@ -60,7 +60,7 @@ def test_gradient_is_that_of_the_energy(model, slid: float):
     gradient = np.zeros_like(q)
     term.add_gradient(q, gradient)
     direction = np.random.default_rng(0).normal(size=q.shape)
-    # larger moves than moves whose change of energy is computed from the forces
+    # moves beyond the limit below which forces give the change of energy
     for step in (
         1e-6,
         1e-7,
@@ -72,8 +72,11 @@ def test_gradient_is_that_of_the_energy(model, slid: float):
 
 @pytest.mark.parametrize("slid", [1e-7, 1e-4])
 def test_a_small_change_of_the_energy_keeps_its_digits(model, slid: float):
-    """By differences of energies it had none: line searches of blocks at rest then cut steps that
-    lead down."""
+    """A change of energy keeps its digits.
+
+    Differences of energies had none: line searches of blocks at rest then shortened steps that led
+    down.
+    """
     term, q = contact(model, slid)
     forward = np.zeros_like(q)
     # the left arm approaches the right arm
@@ -89,7 +92,7 @@ def test_a_small_change_of_the_energy_keeps_its_digits(model, slid: float):
         term.change(q + share * SMALL * 1e-3 / longest * forward, q) / share
         for share in (0.999, 1.001)
     )
-    # on both sides of the move at which another formula takes over
+    # on both sides of the move at which the formula changes
     assert below / above == pytest.approx(1, rel=0.01)
 
 
@@ -98,8 +101,7 @@ def test_hessian_is_that_of_the_gradient_but_for_negative_parts(model, slid: flo
     term, q = contact(model, slid)
     hessian, step = term.hessian(q, False), 1e-8
     assert hessian is not None
-    # the arms come nearer as a whole: where pairs neither turn nor slide nothing is
-    # left out
+    # the arms approach as a whole: no pair turns or slides, so nothing is left out
     direction = np.zeros_like(q)
     direction[q[:, 0] < 0, 0] = 1.0
     product, after, before = (np.zeros_like(q) for _ in range(3))
@@ -175,12 +177,12 @@ def test_the_way_ends_before_surfaces_meet_however_far_it_goes(model):
     for end in (opened, carried):
         assert term.contacts.collision_free_step(q, end) == 1.0
     far = q.copy()
-    # a way of many edge lengths, whose end is free again
+    # a path of many edge lengths whose end is free again
     far[q[:, 0] < 0, 0] += 500 * GAP
     assert 0 < term.contacts.collision_free_step(q, far) < 1 / 500
 
 
-# otherwise the ends of the arms turn inside out
+# otherwise the ends of the arms would turn inside out
 SOLID = solid_of(1e5)
 
 
@@ -203,7 +205,7 @@ def test_a_run_that_goes_on_from_a_checkpoint_is_the_same_to_the_last_bit(tmp_pa
 
 
 def crossing_boxes(folder: Path, deep: float, subdivisions: int) -> Path:
-    """Return the scene of two bars, of which the first dips into the second by a depth [m]."""
+    """Return the scene of two bars; the first reaches into the second by a depth [m]."""
     first = trimesh.creation.box([0.5, 0.25, 0.25])
     second = trimesh.creation.box([0.125, 0.125, 0.5])
     second.apply_translation([0.03, 0.02, 0.125 + 0.25 - deep])
@@ -244,7 +246,7 @@ def test_a_surface_that_cuts_itself_all_over_is_refused(tmp_path):
 
 
 def test_a_coarser_surface_that_cuts_itself_is_no_fault_of_the_mesh(tmp_path):
-    """Flat faces leave slivers on the edges of the coarser surface."""
+    """A coarser surface cuts itself because flat faces leave slivers on its edges."""
     path = block_scene(
         tmp_path, self_contact={"surface": 300}, time={"step": 0.01, "duration": 0.01}
     )
@@ -307,10 +309,9 @@ def test_presets_of_a_are_refused(tmp_path):
 
 @pytest.mark.slow
 def test_a_block_holds_on_a_tilted_one(tmp_path: Path):
-    """It gives way once in the 20 steps for which that is remembered, as far as it would in each,
-    were it not.
+    """A block on a tilted plate creeps only once in 20 steps, when the slip is reset.
 
-    The block falls onto a plate of the same mesh, all seen as tilted by 20 degrees.
+    The block falls onto a plate in the same mesh. Gravity is tilted by 20 degrees.
     """
     cell, tilt = 1 / 16, np.radians(20.0)
     plate = trimesh.creation.box(bounds=[[0, 0, 0], [1.5, 0.375, cell]])
@@ -330,20 +331,21 @@ def test_a_block_holds_on_a_tilted_one(tmp_path: Path):
     model, frames = play(path)
     mass = model.lattice.mass * (model.lattice.nodes[:, 2] > 2 * cell)
     along = np.array([mass @ frame.position[:, 0] for frame in frames]) / mass.sum()
-    # of the block down the plate in each step from the 51st on, at rest on it [m/s]
+    # speed [m/s] of the block down the plate in each step from the 51st on, at rest on
+    # the plate
     speed = np.diff(along)[50:] / 0.01
-    # stick speed [m/s], by the longest side of the two equal meshes
+    # stick speed [m/s], by the longest side of the mesh
     stick = 1e-2 * 1.5
     creep = stick * (1 - np.sqrt(1 - np.tan(tilt) / 0.5))
-    # friction starts anew once in steps 51 to 70
+    # the slip is reset once in steps 51 to 70
     assert speed.mean() == pytest.approx(creep / 20, rel=0.3)
     assert abs(speed[:9].mean()) < 0.01 * creep
-    # a step starts from the end of the last step, not in free flight
+    # a step starts from the end of the last step, not from free flight
     assert max(frame.iterations for frame in frames[51:]) <= 8
 
 
 def test_a_pair_of_edges_is_the_same_whichever_is_found_first():
-    """Or its slip, which goes on from step to step, would be lost, or be that of the other way."""
+    """A pair of edges has one number and one sign of slip, so its slip persists."""
 
     def found(first: int, second: int, at: tuple[float, float]) -> FrictionPairs:
         pair = SimpleNamespace(
@@ -372,9 +374,9 @@ def test_a_pair_of_edges_is_the_same_whichever_is_found_first():
 
 @pytest.mark.slow
 def test_blocks_of_long_triangles_touch_at_their_corners_and_say_so(tmp_path: Path, caplog):
-    """A bulge between the passes lets the upper block sink further.
+    """Between the corners of long triangles a face bulges, so the upper block sinks further.
 
-    Split as finely as the cells, they touch all over.
+    If triangles are as fine as the cells, the faces touch everywhere.
     """
     sunk = []
     trimesh.creation.box(bounds=[[-0.5, -0.5, 0], [0.5, 0.5, 1]]).export(tmp_path / "cube.ply")

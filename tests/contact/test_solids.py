@@ -1,5 +1,4 @@
-"""Obstacles that are spheres, meshes or functions of the user's own: as the planes, boxes and
-spheres they describe."""
+"""Spheres, meshes and functions as obstacles agree with planes, boxes and spheres."""
 
 from pathlib import Path
 
@@ -29,7 +28,7 @@ FALLING = {"time": {"step": 0.01, "duration": 0.25}, "gravity": GRAVITY}
 
 
 def ball(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The signed distance to BALL's surface, and its gradient."""
+    """Return the signed distances to BALL's surface, and their gradients."""
     out = x - CENTER
     far = np.linalg.norm(out, axis=1)
     return far - RADIUS, out / far[:, None]
@@ -37,7 +36,7 @@ def ball(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.fixture(autouse=True)
 def registered():
-    """The function, for the time of a test."""
+    """Register the function for the time of a test."""
     msm.register_obstacle("ball", ball)
     yield
     OBSTACLES._registered.clear()
@@ -49,8 +48,10 @@ def solid_of(mesh: trimesh.Trimesh) -> MeshSolid:
 
 @pytest.mark.parametrize("mesh", [TORUS, STAR, CUT, trimesh.creation.icosphere(3)])
 def test_depths_are_igls_signed_distances(mesh: trimesh.Trimesh):
-    """Whose sign is that of the winding number, found in quite another way; of edges inwards and
-    outwards, of parts."""
+    """Depths agree with igl's signed distance by winding number, a different method.
+
+    The meshes have inward and outward edges and several parts.
+    """
     low, high = mesh.bounds
     x = np.random.default_rng(1).uniform(low - 0.3, high + 0.3, (3000, 3))
     kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_WINDING_NUMBER
@@ -80,7 +81,7 @@ def test_normals_are_the_slope_of_depths_and_a_small_change_keeps_its_digits(sol
         for e in np.eye(3)
     ]
     off = np.abs(normals + np.array(slope).T).max(axis=1)
-    # but where the nearest triangle changes
+    # except where the nearest triangle changes
     assert len(x) > 30 and np.median(off) < 1e-8 and (off < 1e-4).mean() > 0.95
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
     # a difference of depths would keep seven of its digits
@@ -116,12 +117,12 @@ RESPONSES = [
 ]
 
 
-# each integrator with a response; a large sphere has it with the other
+# each integrator with one response; a large sphere has it with the other response
 @pytest.mark.parametrize(
     ("integrator", "response"), [("implicit-euler", 0), ("bdf2", 1), ("verlet", 0)]
 )
 def test_a_function_is_the_sphere_that_it_describes(tmp_path: Path, response: int, integrator: str):
-    """The block meets the sphere off its top and slips to one side."""
+    """A function and the sphere give the same run; the block slips off the top to one side."""
     positions = []
     time = {"time": {**FALLING["time"], "integrator": integrator}}
     for obstacle in (BALL, OWN):
@@ -135,8 +136,10 @@ def test_a_function_is_the_sphere_that_it_describes(tmp_path: Path, response: in
 
 
 def test_a_mesh_is_the_box_that_it_describes(tmp_path: Path):
-    """The block falls aslant on a plate with friction; the faces by which it came in make no
-    difference here."""
+    """A mesh and the box give the same run: a block falls obliquely on a plate with friction.
+
+    The faces that nodes entered by, which only a box knows, have no effect here.
+    """
     corners = np.array([[-0.2, -0.2, -0.5], [0.7, 0.7, -0.02]])
     trimesh.creation.box(bounds=corners).export(tmp_path / "plate.ply")
     shapes = [
@@ -168,8 +171,10 @@ def test_a_mesh_is_prepared_as_a_bodys_and_ranks_agree(tmp_path: Path):
 
 
 def test_the_surface_of_a_function_is_in_the_file(tmp_path: Path):
-    """By marching cubes, within a cell of its grid, cut below; under its number among the
-    obstacles."""
+    """The file has the function's surface by marching cubes, to a cell of their grid.
+
+    It has the number of its obstacle, and ends at the bottom of the grid.
+    """
     plane = plane_at(-9)
     scene = block_scene(tmp_path, obstacle=[plane, OWN], **FALLING)
     with msm.open(msm.run(scene, tmp_path / "x.h5", quiet=True)) as result:
@@ -186,7 +191,7 @@ PLANE = plane_at(-0.02)
 SPHERE = {"shape": "sphere", "center": [0.25, 0.25, -0.02 - FLAT], "radius": FLAT}
 # gravity that makes the block slide
 SLOPED = {"acceleration": [2.0, 0, -G]}
-# step error: the push is as accurate as a depth
+# step error: pushes are as accurate as depths
 ERROR = 1e-6
 PLAIN = [{"response": "reflect", "restitution": 0.5}, {"response": "penalty", "friction": 0.3}]
 

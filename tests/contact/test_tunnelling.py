@@ -1,5 +1,7 @@
-"""Nodes and plates that would pass each other within a step, obstacles that nodes begin in, and the
-energy of both."""
+"""Nodes and plates that would pass each other within a step, and nodes that begin in obstacles.
+
+Energies are checked too.
+"""
 
 import re
 from pathlib import Path
@@ -30,7 +32,7 @@ places = arrays(float, 3, elements=st.integers(-40, 40).map(lambda x: x / 16 + 0
 @settings(max_examples=300, deadline=None)
 @given(places, places)
 def test_the_side_is_the_face_that_a_way_first_goes_through(start: np.ndarray, end: np.ndarray):
-    """Against 4001 places of the way; grazed corners, which they may miss, are left out."""
+    """The face agrees with 4001 points of the path, except at corners that the path grazes."""
     way = start + np.linspace(0, 1, 4001)[:, None] * (end - start)
     inside, face = CUBE.solid.depths(way)
     side = CUBE.sides(start[None], end[None], 1.0, 1.0)[0]
@@ -53,7 +55,7 @@ def test_a_side_is_kept_until_the_node_is_out_or_has_slid_off():
         x = np.array([x], float)
         return THIN.sides(x, x, 1.0, 0.1, np.array([TOP], np.int8))[0]
 
-    # the bottom is nearer, but the node entered by the top
+    # the bottom is nearer, but the node entered through the top
     assert kept([0, 0, 0.0001]) == TOP
     # the node was pressed through the box
     assert kept([0, 0, -0.3]) == TOP
@@ -101,8 +103,10 @@ STIFF = {"young_modulus": 1e6, "density": 1000.0}
 def against_a_plate(
     folder: Path, integrator: str, response: str, speed: float, moving: bool, **tables
 ) -> Path:
-    """A plate of a hundredth of a cell 0.1 m under a block that falls on it, or that it comes up
-    to; no gravity."""
+    """Return the scene of a block and a plate of a hundredth of a cell, 0.1 m below, that meet.
+
+    The block falls or the plate rises. There is no gravity.
+    """
     steps = 10 + int(np.ceil(0.4 / speed / STEP))
     plate = box_at([[-9, -9, -0.10125], [9, 9, -0.1]], response=response)
     start = {}
@@ -129,13 +133,13 @@ def test_no_node_gets_past_a_thin_plate(
     speed: float,
     moving: bool,
 ):
-    """At 100 m/s the plate is folded over within a step. Its energy gain is reported."""
+    """No node passes the plate. At 100 m/s the block folds; its energy gain is reported."""
     model, frames = play(against_a_plate(tmp_path, integrator, response, speed, moving))
     last, mass = frames[-1], model.lattice.mass
     top = -0.1 + (speed * last.time if moving else 0)
     assert last.position[:, 2].min() > top - 0.02
     leaves = last.momentum[2] / mass.sum() - (speed if moving else 0)
-    # the plate buckles: implicit Euler at 100 m/s leaves 9.5% of the speed with penalty
+    # the block buckles: implicit Euler at 100 m/s leaves 9.5% of the speed with penalty
     assert leaves > 0.05 * speed
     if not moving:
         assert totals(frames).max() < 1.011 * totals(frames)[0] or told(caplog, "from nowhere")
@@ -143,9 +147,9 @@ def test_no_node_gets_past_a_thin_plate(
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_to_and_from_a_moving_frame_nothing_changes(tmp_path: Path, integrator: str):
-    """A moving plate, and the same plate at rest in its frame, with friction.
+    """A moving plate with friction gives the same run as the plate at rest in its own frame.
 
-    Verlet's substeps differ.
+    With Verlet the numbers of substeps differ.
     """
     tables = {"solver": {"preset": "newton", "error": 1e-10}}
     positions = []
@@ -159,7 +163,7 @@ def test_to_and_from_a_moving_frame_nothing_changes(tmp_path: Path, integrator: 
 
 
 def test_a_body_rests_on_a_plate_thinner_than_its_push_is_deep(tmp_path: Path):
-    """Every node at the bottom lies below the far face, for good."""
+    """Every node at the bottom stays below the far face of the plate."""
     floor = box_at([[-9, -9, -1e-6], [9, 9, 0]], response="penalty", friction=0.5)
     time = {"step": 0.05, "duration": 2.0}
     _, frames = play(block_scene(tmp_path, BLOCK, time=time, gravity=GRAVITY, obstacle=[floor]))
@@ -186,8 +190,7 @@ def test_a_step_whose_nodes_cannot_be_settled_fails_in_words(tmp_path: Path, mon
 
 
 def test_nodes_that_come_in_by_another_face_each_time_a_step_is_solved_settle(tmp_path: Path):
-    """A plate that comes edge first meets a fast body by its corner, out of a larger run of random
-    boxes."""
+    """A plate that comes edge first meets the corner of a fast body, a case from random boxes."""
     plate = box_at([[-1.481, 2.832, 0.2023], [1.519, 5.832, 0.2523]], response="penalty")
     plate["path"] = [{"time": 0.05, "by": [0.89, -7.54, 0.155]}]
     around = box_at([[-1.75, -1.46, 0.1771], [1.249, 1.54, 0.4771]], start=0.01, stop=0.03)
@@ -215,7 +218,7 @@ def ball(folder: Path, **tables) -> Path:
 
 
 def totals(frames) -> np.ndarray:
-    """[J] of each frame."""
+    """Return the total energy [J] of each frame."""
     return np.array(
         [frame.kinetic + frame.elastic + frame.potential + frame.contact for frame in frames]
     )
@@ -232,8 +235,10 @@ def test_bdf2_does_not_sink_into_what_gives_nothing_back(tmp_path: Path):
 @pytest.mark.parametrize("response", ["reflect", "penalty"])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_the_work_of_a_moving_obstacle_is_counted(tmp_path: Path, integrator: str, response: str):
-    """A plane that strikes a ball at rest: verlet with ``reflect`` used to end at once, having
-    "gained" it all."""
+    """A plane strikes a ball at rest, and the energy balance counts the work of the plane.
+
+    Verlet with ``reflect`` once ended at once, because it took this work for a gain.
+    """
     floor = plane_at(-0.53, response=response)
     floor["path"] = [{"time": 1.0, "by": [0, 0, 20.0]}]
     time = {"step": 0.001, "duration": 0.08, "integrator": integrator}
@@ -251,10 +256,10 @@ def told(caplog: pytest.LogCaptureFixture, what: str) -> list[str]:
 def test_energy_from_nowhere_is_told_once_with_its_frame(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ):
-    """The paper's exchange sets nodes back against their springs.
+    """The paper's exchange moves nodes back against their springs, which adds energy.
 
-    It gives 4% of a ball's energy at steps of 1 ms. The report is a share of the body's energy, not
-    of the exchanged energy.
+    It adds 4% of a ball's energy at steps of 1 ms. The report is relative to the body's energy, not
+    to the exchanged energy.
     """
     floor = plane_at(-0.6, response="exchange")
     scene = {
@@ -280,7 +285,7 @@ def test_energy_from_nowhere_is_told_once_with_its_frame(
 def test_swings_and_loose_steps_are_no_gain(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, integrator: str
 ):
-    """A body let go stretched by a tenth, at verlet's limit and at a step error of 0.1."""
+    """A body released at a strain of 0.1 gains nothing, also at a step error of 0.1."""
     time = {"step": 0.01, "duration": 0.3, "integrator": integrator}
     solver = {"preset": "newton", "error": 0.1}
     play(block_scene(tmp_path, time=time, start={"scale": [1.1, 1, 1]}, solver=solver))
@@ -290,8 +295,7 @@ def test_swings_and_loose_steps_are_no_gain(
 def test_nodes_that_begin_inside_are_told_with_number_depth_and_place(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ):
-    """A block 0.25 m high, of 3 x 3 x 3 nodes, half under the ground; the tops of two pins do not
-    count."""
+    """Half of a block of 3 x 3 x 3 nodes is under the ground; nodes of pins do not count."""
     ground = plane_at(0.2, response="exchange")
     high = box_at([[-1, -1, 9], [1, 1, 10]], response="penalty")
     late = box_at([[-1, -1, -1], [0.1, 1, 1]], response="penalty", start=0.02)

@@ -1,4 +1,4 @@
-"""Bending and twist of cells: rules for any cell, and errors of few cells."""
+"""Bending and twist of cells: properties of any cell, and errors of few cells."""
 
 import few_cells as study
 import numpy as np
@@ -36,7 +36,7 @@ def test_a_rotation_turns_the_gradient_and_costs_nothing(poisson: float, cut: bo
 def test_folded_and_collapsed_cells_have_finite_forces_and_no_energy_below_rest(
     poisson: float, cut: bool
 ):
-    """U is no less than its parabola's minimum; all else is a sum of squares, less 3 mu V / 2."""
+    """No energy is below rest: U is at least its parabola's minimum, all else a sum of squares."""
     lattice = solid(2, 2, 1, poisson=poisson, cut=cut)
     elastic = Elasticity(lattice)
     x = lattice.nodes
@@ -75,7 +75,7 @@ def test_diagonal_blocks_are_those_of_the_projected_hessian(poisson: float, cut:
 
 
 def test_the_bounding_laplacian_is_no_less_than_the_hessian_at_rest_of_any_part_of_a_cell():
-    """Parts of a cell beyond a plane, and thin fibres across the grid, whose Laplacian is less."""
+    """The bound holds for parts of a cell beyond a plane and for thin oblique fibres."""
     lacking = 0
     for trial in range(60):
         points = points_inside(RNG, 200)
@@ -115,8 +115,11 @@ def test_the_bounding_laplacian_of_uncorrelated_coordinates_is_the_laplacian():
 
 @pytest.mark.parametrize("poisson", study.POISSON)
 def test_few_cells_bend_and_twist(poisson: float):
-    """Bars twist as trilinear hexahedra do: 19 and 5.3% too stiff by the warping of two and four
-    cells. Plates of a single cell are right. Cantilevers clamped as hexahedra are within 2.5%."""
+    """Bars of few cells twist too stiffly, while plates and cantilevers bend correctly.
+
+    Bars of two and four cells are 19 and 5.3% too stiff, as with trilinear hexahedra. A plate of a
+    single cell is right. Cantilevers are within 2.5% of hexahedra that are clamped alike.
+    """
     assert study.torsion_error(2, poisson) == pytest.approx(0.187, abs=0.005)
     assert study.torsion_error(4, poisson) == pytest.approx(0.053, abs=0.002)
     assert study.plate_error(1, poisson, False) == pytest.approx(0, abs=0.015)
@@ -132,10 +135,7 @@ def test_strips_thinner_than_their_cells_bend(poisson: float, thickness: float, 
 
 @pytest.mark.parametrize("stretch", [0.7, 1.5])
 def test_a_stretched_cell_bends_by_its_tangent_within_a_factor_of_two(stretch: float):
-    """The bending stiffness of a stretched cell, nu = 0, against the tangent.
-
-    The tangent is P'(lambda) = mu (1 + 1 / lambda^2).
-    """
+    """A stretched cell bends by its tangent P'(lambda) = mu (1 + 1 / lambda^2), for nu = 0."""
     lattice = solid(1, 1, 1, poisson=0.0)
     elastic = Elasticity(lattice)
     q = lattice.nodes * [stretch, 1, 1]

@@ -1,4 +1,4 @@
-"""Volumes of cells, and cells of a neo-Hookean solid that are inside out: it turns them back."""
+"""Volumes of cells, and cells that are inside out, which a neo-Hookean solid turns back."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ def test_volumes_at_rest_and_mirrored():
         np.testing.assert_allclose(
             least_volumes(rest * (1 - 2 * (np.arange(3) == axis)), cells), -(H**3), rtol=1e-12
         )
-    # The corners of a stretched cell have the same volume: the determinant.
+    # The corners of a stretched cell all have the same volume: the determinant.
     stretch = np.array([[1.2, 0.3, 0], [0, 0.9, -0.2], [0.1, 0, 0.8]])
     np.testing.assert_allclose(
         least_volumes(rest @ stretch.T, cells), np.linalg.det(stretch) * H**3, rtol=1e-12
@@ -39,20 +39,20 @@ def test_volumes_at_rest_and_mirrored():
 
 @pytest.mark.parametrize("corner", range(8))
 def test_a_corner_pushed_through_its_cell_makes_its_volume_least(corner: int):
-    """A unit cube whose corner is moved inwards by s along all edges.
+    """A corner moved inwards by s along all edges makes the least volume, at this corner.
 
-    Its own edges keep 1 - s, less by their tilt.
+    The edges at the corner become e_k = unit_k - s (1, 1, 1).
     """
     one = lattice_of(1, 1, 1)
     cell, q = one.local_cells[0], one.nodes / H
     inwards = 2 * q.mean(axis=0) - 2 * q[cell[corner]]
     q[cell[corner]] += 0.8 * inwards
-    # the edges e_k = (unit_k - 0.8 (1, 1, 1)): det(I - 0.8 * ones) = 1 - 3 * 0.8
+    # det(I - 0.8 * ones) = 1 - 3 * 0.8
     np.testing.assert_allclose(least_volumes(q, one.local_cells), 1 - 2.4, rtol=1e-12)
 
 
 def after_many_steps(lattice: Lattice, start: np.ndarray) -> np.ndarray:
-    """Let go from rest at ``start``; implicit Euler damps. (n, 3) [m]"""
+    """Return the positions (n, 3) [m] after 150 damped steps from rest at ``start``."""
     stepper = Stepper(COMM, lattice, T, find_preset("newton"), error=1e-4)
     q = before = start
     try:
@@ -64,8 +64,11 @@ def after_many_steps(lattice: Lattice, start: np.ndarray) -> np.ndarray:
 
 
 def test_a_cell_folded_into_its_neighbour_comes_back_as_a_solid_and_stays_as_springs():
-    """The end of a bar is pushed through the face that its last cell shares with the next. The cell
-    is mirrored there: all its springs have their lengths, so that to Hooke's law it is at rest."""
+    """A cell folded into its neighbour unfolds as a solid and stays folded as springs.
+
+    The end of a bar is pushed through the last cell's inner face. The mirrored cell has all its
+    springs at rest length, so Hooke's law resists nothing.
+    """
     bar = lattice_of(3, 1, 1)
     start = bar.nodes + 0.02 * H * np.random.default_rng(7).normal(size=bar.nodes.shape)
     start[np.isclose(bar.nodes[:, 0], bar.nodes[:, 0].min()), 0] += 1.5 * H
@@ -82,7 +85,7 @@ def test_a_cell_folded_into_its_neighbour_comes_back_as_a_solid_and_stays_as_spr
 
 @pytest.mark.parametrize("seed", range(2))
 def test_a_mirrored_cell_unfolds_without_a_step_that_fails(seed: int):
-    """Its Hessian is indefinite: newton must leave the projected Hessian."""
+    """The Hessian of the cell is indefinite, so newton must leave the projected Hessian."""
     one = lattice_of(1, 1, 1)
     start = one.nodes * [1, 1, -1] + 0.05 * H * np.random.default_rng(seed).normal(
         size=one.nodes.shape
@@ -96,8 +99,7 @@ def test_a_mirrored_cell_unfolds_without_a_step_that_fails(seed: int):
 def squeezed_step(
     preset: str, height: float, error: float
 ) -> tuple[np.ndarray, float, Lattice, np.ndarray]:
-    """A step of a block from rest at a share of its height: x, the error declared, the block,
-    q_n."""
+    """Step a block from rest at a share of its height; return x, stated error, block and q_n."""
     lattice = lattice_of(3, 3, 3)
     shake = 0.02 * H * np.random.default_rng(9).normal(size=lattice.nodes.shape)
     q = (lattice.nodes - lattice.nodes.mean(axis=0)) * [1, 1, height] + shake

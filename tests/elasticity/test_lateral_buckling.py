@@ -2,12 +2,13 @@
 
 The textbook's load, TEXTBOOK, is not the critical load of this beam:
 
-- Its correction for the bend before the beam buckles is that of a uniform bend. A rod bent by
-  the load itself buckles at 1.0236 of it.
+- Its correction for the deflection before buckling assumes uniform bending. A rod bent by the
+  load itself buckles at 1.0236 of TEXTBOOK.
 - A clamp holds the warping. Hexahedra twist as if 0.383 m at the clamp did not. The rod then
   buckles at 1.071, the hexahedra at 1.072.
 
-So 0.9 of TEXTBOOK is 0.84 of the critical load, where 1% of G J is 2.3% sideways.
+So 0.9 of TEXTBOOK is 0.84 of the critical load. There 1% of G J changes the sideways deflection by
+2.3%.
 """
 
 import narrow_beam as study
@@ -20,7 +21,7 @@ LOAD = 0.9 * study.TEXTBOOK
 
 
 def test_a_rod_whose_clamp_holds_the_warping_buckles_as_hexahedra():
-    """Without the load's own bend, or with a clamp that lets the section warp, it does not."""
+    """The rod agrees with hexahedra if its clamp holds the warping and its load bends it."""
     assert study.rod_critical() / study.TEXTBOOK == pytest.approx(1.0236, abs=1e-3)
     rod = study.rod_critical(study.HELD) / study.TEXTBOOK
     assert rod == pytest.approx(study.CRITICAL, rel=0.003)
@@ -29,15 +30,18 @@ def test_a_rod_whose_clamp_holds_the_warping_buckles_as_hexahedra():
 
 @pytest.mark.slow
 def test_hexahedra_buckle_where_the_finest_do():
-    """Two across the width: their G J is 0.3% too large."""
+    """Two hexahedra across the width have a G J that is 0.3% too large."""
     beam = study.Hexahedra(2, 6, 0.125)
     assert study.shortening(beam) == pytest.approx(study.HELD, abs=0.005)
     assert study.critical(beam) / study.TEXTBOOK == pytest.approx(1.0018 * study.CRITICAL, rel=1e-3)
 
 
 def test_a_lattice_buckles_late_by_its_torsion():
-    """Cells bend exactly, but trilinear functions cannot warp as the edges of a strip do: G J is
-    3.5% too large with two cells across."""
+    """Two cells across buckle 2% late, because their G J is 3.5% too large.
+
+    Cells bend exactly, but trilinear functions cannot represent the warping at the edges of a
+    strip.
+    """
     error = torsion_error(2, NU, 4)
     assert error == pytest.approx(0.035, abs=0.002)
     ratio = study.critical(study.LatticeBeam(2)) / study.TEXTBOOK / study.CRITICAL
@@ -47,7 +51,7 @@ def test_a_lattice_buckles_late_by_its_torsion():
 
 
 def test_a_run_near_buckling_goes_sideways_as_its_critical_load_says():
-    """The load multiplies 2% of the critical load: two cells across are 8% off."""
+    """Near buckling an error of 2% in the critical load grows to 8% of the sideways deflection."""
     force = held(0, study.LENGTH, 1) | {"total": [0, study.ASIDE * LOAD, -LOAD]}
     end = run(
         box(study.LENGTH, study.WIDTH, study.HEIGHT),

@@ -1,5 +1,4 @@
-"""The neo-Hookean solid against closed forms, finite differences and dense eigenvalues, in whole
-and in cut cells."""
+"""The neo-Hookean solid in whole and cut cells, against closed forms and finite differences."""
 
 from pathlib import Path
 
@@ -26,7 +25,7 @@ RNG = np.random.default_rng(30)
 
 @pytest.fixture(autouse=True)
 def same_noise(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Begin each test with the same noise, whatever tests its worker ran before."""
+    """Reseed the noise before each test, so that it does not depend on earlier tests."""
     monkeypatch.setitem(globals(), "RNG", np.random.default_rng(30))
 
 
@@ -34,9 +33,9 @@ YOUNG, H = 3e4, 0.1
 
 
 def points_inside(rng: np.random.Generator, n: int) -> np.ndarray:
-    """Return points (k, 3) of a random part of a cell about its middle.
+    """Return points (k, 3) of a random part of a cell, relative to the cell's middle.
 
-    The part is a half space, from a sliver to nearly all.
+    The part is a half space, from a sliver to nearly the whole cell.
     """
     points = rng.random((n, 3)) - 0.5
     height = points @ rng.standard_normal(3)
@@ -44,15 +43,14 @@ def points_inside(rng: np.random.Generator, n: int) -> np.ndarray:
 
 
 def moments(points: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Fills (8,) of the corners and second moments (3,) of a part of a cell, sums over points of
-    it."""
+    """Return fills (8,) of corners and second moments (3,) of a part, by sums over its points."""
     return 8 * (0.5 + SIGNS * points[:, None]).prod(axis=2).sum(axis=0) / n, (points**2).sum(
         axis=0
     ) / n
 
 
 def solid(*sides: int, poisson: float, cut: bool = False, volume: str = "quadratic") -> Lattice:
-    """A block of whole or of randomly cut cells."""
+    """Return the lattice of a block of whole or of randomly cut cells."""
     material = Material(
         density=1000, young_modulus=YOUNG, law="neo-hookean", poisson_ratio=poisson, volume=volume
     )
@@ -85,7 +83,7 @@ kinds = pytest.mark.parametrize(
 
 @kinds
 def test_gradient_and_hessian_are_slopes_of_the_energy(poisson: float, cut: bool, volume: str):
-    """In states from strained to inverted: both branches of U."""
+    """The derivatives hold in states from strained to inverted, on both branches of U."""
     lattice = solid(3, 2, 2, poisson=poisson, cut=cut, volume=volume)
     elastic = Elasticity(lattice)
     for strain in (0.05, 0.5):
@@ -100,7 +98,7 @@ def test_gradient_and_hessian_are_slopes_of_the_energy(poisson: float, cut: bool
 
 
 def test_blocks_of_whole_cells_share_their_constants_wherever_cut_ones_lie():
-    """The first and every seventh of 96 cells are cut; two materials."""
+    """Blocks share constants if every seventh of 96 cells is cut, with two materials."""
     lattice = solid(6, 4, 4, poisson=0.3)
     assert lattice.solid is not None
     cut, hard = (
@@ -111,7 +109,7 @@ def test_blocks_of_whole_cells_share_their_constants_wherever_cut_ones_lie():
     forms[cut] *= RNG.uniform(0.5, 1.0, size=(cut.sum(), 1))
     of_cells = lattice.solid._replace(forms=forms, shear=shear)
     blocks = NeoHookean.of_lattice(Lattice(**(vars(lattice) | {"solid": of_cells}))).blocks
-    # two full cells, two of parts, two cut cells
+    # two blocks of whole cells, two of mixed cells, two of cut cells
     assert len(blocks.nodes) == 12 and len(blocks.constants) <= 2 + 2 + 2
     kept = blocks.constants[blocks.which].reshape(12, 15, 8).transpose(0, 2, 1).reshape(96, 15)
     order = [
@@ -127,10 +125,11 @@ def test_blocks_of_whole_cells_share_their_constants_wherever_cut_ones_lie():
 
 @pytest.mark.parametrize("cut", [False, True])
 def test_a_softened_solid_is_one_of_less_lambda_meanwhile(cut: bool):
-    """Meanwhile lambda = 49 mu is at most mu, as for Poisson's ratio 1/4.
+    """A softened solid has lambda = mu instead of 49 mu, as for Poisson's ratio 1/4.
 
-    A Hessian with the pressure of the softer solid is that solid's in cells without bending. Above
-    it lies only the resistance to the change of each cell's volume and to three sums of its modes.
+    In cells without bending, a Hessian with the pressures of the softer solid equals that of the
+    softer solid. Otherwise it adds resistance to changes of the cell's volume and of three sums of
+    its modes.
     """
     lattice = solid(2, 2, 1, poisson=0.49, cut=cut)
     assert lattice.solid is not None
@@ -200,13 +199,13 @@ def test_projected_hessian_is_semidefinite_and_the_other_no_less_than_minus_its_
             lowest = np.linalg.eigvalsh(dense_hessian(elastic, q) + np.diag(concavity)).min()
             assert lowest > -1e-12 * size
             worst = max(worst, -np.linalg.eigvalsh(dense_hessian(elastic, q)).min())
-    # the bound was tested by some cells
+    # some cells test the bound
     assert worst > 0.1 * YOUNG * H * lattice.solid.volume.mean() / H**3
     assert elastic.concavity(lattice.nodes).max() < 1e-9 * YOUNG * H
 
 
 def test_ten_thousand_cut_cells_are_semidefinite_at_rest():
-    """The Laplacian of each cell, also less the square of the mean slope (Jensen)."""
+    """The Laplacian of a cell is semidefinite, also less the square of the mean slope (Jensen)."""
     count, n = 10_000, 60
     fills, second = map(
         np.array, zip(*(moments(points_inside(RNG, n), n) for _ in range(count)), strict=True)
@@ -223,8 +222,7 @@ def test_ten_thousand_cut_cells_are_semidefinite_at_rest():
 
 
 def test_whole_cells_have_springs_on_face_and_space_diagonals_alone():
-    """As K of a trilinear cell has them, times 2 mu + 3 lambda, which bounds the Hessian: both are
-    1."""
+    """Only diagonals have springs, as K of a trilinear cell times 2 mu + 3 lambda = 1."""
     lattice = build_lattice(
         cages_of(block(1, 1, 1), H), Material(density=1000, young_modulus=2.5, law="neo-hookean")
     ).with_springs()
@@ -236,7 +234,7 @@ def test_whole_cells_have_springs_on_face_and_space_diagonals_alone():
 def test_the_constant_laplacian_is_no_less_than_the_hessian_at_rest(
     poisson: float, cut: bool, volume: str
 ):
-    """So that local/global iterations, which solve with it, come nearer."""
+    """The bound makes local/global iterations, which solve with this Laplacian, converge."""
     lattice = solid(3, 2, 2, poisson=poisson, volume=volume)
     laplacian = np.zeros(2 * (len(lattice.nodes),))
     springs = lattice.with_springs()
@@ -310,7 +308,7 @@ def test_below_the_onset_the_volume_energy_goes_on_smoothly(volume: str):
 
 
 def test_a_cell_is_inside_out_where_what_is_inside_of_it_is():
-    """A sliver's far corner may fold. The mean deformation gradient inside decides."""
+    """The mean deformation gradient of the part inside decides; a sliver's far corner may fold."""
     lattice = solid(1, 1, 1, poisson=0.45)
     points = 0.02 * RNG.random((100, 3)) - 0.5
     fills, second = moments(points, 10**8)

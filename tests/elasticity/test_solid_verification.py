@@ -1,4 +1,4 @@
-"""The neo-Hookean solid in runs of scenes, against theory (tables: scripts/results/solid.md)."""
+"""Runs of the neo-Hookean solid against theory (tables: scripts/results/solid.md)."""
 
 import numpy as np
 import pytest
@@ -11,9 +11,12 @@ from msmpetsc.elasticity.energy import Elasticity
 
 @pytest.mark.parametrize(("poisson", "iterations"), [(0.25, 35), (0.49, 50), (0.4999, 70)])
 def test_an_elastica_two_cells_thick_ends_where_it_should(poisson: float, iterations: int):
-    """P L^2 / (E I) = 5: the tip is 0.71379 L down, 0.38763 L back; springs are 9% of the length
-    off. All at once: without softer solids that lead on, the second takes 64 and the third
-    1,108. The first takes 28 to 30, by the rounding of freshly compiled or stored kernels."""
+    """For P L^2 / (E I) = 5 the tip is 0.71379 L down and 0.38763 L back.
+
+    With springs the error is 9% of the length. Without softer solids the second case takes 64
+    iterations and the third 1,108. The first takes 28 to 30, depending on rounding in compiled
+    kernels.
+    """
     of = study.elastica(2, poisson)
     back, _, down = -of.moved(study.LENGTH) / study.LENGTH
     assert np.hypot(down - study.DOWN, back - study.BACK) < 0.015 and of.iterations < iterations
@@ -23,9 +26,11 @@ def test_an_elastica_two_cells_thick_ends_where_it_should(poisson: float, iterat
 def test_a_bar_turned_by_half_a_turn_is_as_stiff_as_trilinear_cells(
     across: int, bound: list[float]
 ):
-    """At small angles the errors are 19% and 5.3%. At 180 degrees plain trilinear hexahedra have
-    17.9% and 5.2%. Assumed strains turn with a cell's mean rotation, and each of two cells across
-    twists by 15 degrees."""
+    """Errors stay near 19% and 5.3%, their values at small angles, up to 180 degrees.
+
+    At 180 degrees plain trilinear hexahedra have 17.9% and 5.2%. Assumed strains turn with a cell's
+    mean rotation, and each of two cells across twists by 15 degrees.
+    """
     errors = np.array(list(study.turned_errors(across).values()))
     assert (errors > 0).all() and (errors < bound).all()
 
@@ -33,8 +38,7 @@ def test_a_bar_turned_by_half_a_turn_is_as_stiff_as_trilinear_cells(
 @pytest.mark.parametrize("start", study.STARTS)
 @pytest.mark.parametrize("poisson", [0.25, 0.45, 0.49])
 def test_statics_find_one_state_wherever_a_bar_starts(poisson: float, start: str):
-    """A start that is twisted, mirrored or scattered ends in no fold: the state is that from the
-    rest shape."""
+    """Twisted, mirrored and scattered starts lead to the state of the rest shape."""
     tables = {
         "pin": [study.held(0, 0, -1)],
         "gravity": {"acceleration": [0, 0, -1]},
@@ -64,7 +68,7 @@ STRAINS = [
 
 @pytest.mark.parametrize("poisson", study.POISSON)
 def test_the_forces_are_the_textbooks(poisson: float):
-    """P n on the faces of a block, half of it at edges, and nothing inside."""
+    """Forces equal P n on the faces of a block, half of it at edges, and zero inside."""
     h, cells = 0.125, (4, 3, 2)
     lattice = small_strain.box(cells, h, poisson)
     sides = h * np.array(cells)

@@ -22,7 +22,7 @@ HOOKE = Springs(SPRINGS, REST, STIFFNESS)
 
 
 def energy(q: np.ndarray, springs: Springs = HOOKE) -> float:
-    """Return the energy, by its change from springs without length, which have k r^2 / 2."""
+    """Return the energy by its change from springs of length zero, which have k r^2 / 2."""
     without_length = 0.5 * springs.stiffness @ springs.rest_length**2
     return without_length + OwnedSprings(springs).change(q, np.zeros_like(q))
 
@@ -82,13 +82,12 @@ def test_projected_hessian_is_positive_where_the_true_one_is_not():
 
 
 def test_a_change_of_energy_keeps_its_digits():
-    """Against the first and second derivative: a plain difference of energies has no digit left
-    here."""
+    """A small change equals its Taylor sum; a difference of energies would have no digits."""
     # Q + dQ is rounded, so v is dQ after rounding
     v = (Q + 1e-10 * RNG.normal(size=Q.shape)) - Q
     first, second = (gradient(Q) * v).sum(), 0.5 * (hessian_times(Q, v) * v).sum()
     change = OwnedSprings(HOOKE).change(Q + v, Q)
-    # near a minimum only this is left, without the loads
+    # near a minimum the change is of second order, without the loads
     assert change - first == pytest.approx(second, rel=1e-4, abs=0)
     far = 3 * Q + 1
     assert OwnedSprings(HOOKE).change(far, Q) == pytest.approx(energy(far) - energy(Q), rel=1e-12)

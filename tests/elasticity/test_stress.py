@@ -28,14 +28,16 @@ def at_rest(path: Path, *overrides: str) -> tuple[Model, Frame]:
 
 
 def along_x(low: float, high: float) -> dict:
-    """Region from low to high, across the whole body."""
+    """Return the region between two planes across the whole body."""
     return {"box": [[low, -9, -9], [high, 9, 9]]}
 
 
 @pytest.mark.parametrize(("poisson", "cut"), [(0.25, False), (0.45, True)])
 def test_uniform_strain_has_the_textbooks_stress_in_cells_and_at_nodes(poisson: float, cut: bool):
-    """J sigma = mu (F F^T - I) + lambda (J - 1) J I; the pressure is the tensor's, von Mises'
-    stress its principal stresses'."""
+    """J sigma = mu (F F^T - I) + lambda (J - 1) J I, in cells and at nodes.
+
+    The pressure is that of the tensor, von Mises' stress that of the principal stresses.
+    """
     lattice = solid(3, 2, 2, poisson=poisson, cut=cut)
     mu, lame = YOUNG / 2 / (1 + poisson), YOUNG * poisson / (1 + poisson) / (1 - 2 * poisson)
     elastic = Elasticity(lattice)
@@ -83,7 +85,7 @@ def test_the_stress_of_a_collapsed_cell_is_finite():
 
 
 def test_a_bar_in_tension_has_force_over_area(tmp_path):
-    """The area is the area of the pulled bar."""
+    """The stress of a bar in tension is the force over the deformed area."""
     scene = block_scene(
         tmp_path, np.array([1.0, 0.25, 0.25]), **STATIC, material=of_law(0.3),
         pin=[{"region": along_x(-0.01, 0.01)}],
@@ -101,8 +103,7 @@ def test_a_bar_in_tension_has_force_over_area(tmp_path):
 
 
 def test_a_beam_in_bending_has_the_moment_times_the_height_over_i(tmp_path):
-    """Cells in the middle third of a cantilever: M z / I at their own middles, four through the
-    depth."""
+    """Stresses in the middle third of a cantilever are M z / I at the cells' middles."""
     length, depth, width, pull = 4.0, 0.5, 0.25, -0.1
     scene = block_scene(
         tmp_path, np.array([length, width, depth]), **STATIC, material=of_law(0.25),
@@ -127,7 +128,7 @@ def test_springs_are_refused_in_one_line(tmp_path):
 
 
 def test_both_sides_of_a_slit_have_their_own_stress(tmp_path):
-    """A fork open towards x: a cell's two copies have the first corner at the slit's closed end."""
+    """The two copies of a cell at the closed end of a slit have different stresses."""
     bar, gap = trimesh.creation.box(bounds=[[0, 0, 0], [8, 2, 5]]), [[2, -1, 2.3], [9, 3, 2.5]]
     slit = trimesh.creation.box(bounds=gap)
     fork = trimesh.boolean.difference([bar, slit], engine="manifold").apply_scale(CELL)

@@ -1,4 +1,4 @@
-"""Exported files are read back by independent libraries, and hold the frames of the result."""
+"""Independent libraries read exported files back and find the frames of the result."""
 
 import json
 from pathlib import Path
@@ -43,7 +43,7 @@ def far_frames() -> list[Frame]:
 
 
 def complaints(reader: vtk.vtkAlgorithm) -> list[str]:
-    """Return a list that gets every error and warning of a VTK reader."""
+    """Return a list that collects every error and warning of a VTK reader."""
     heard: list[str] = []
 
     def hear(_, event: str, text: str) -> None:
@@ -106,7 +106,7 @@ def test_normals_are_those_of_a_ball():
     ball = trimesh.creation.icosphere(subdivisions=2)
     assert np.allclose(normals(ball.vertices, ball.faces), ball.vertices, atol=0.03)
     alone = normals(np.zeros((4, 3)), np.array([[0, 1, 2]]))
-    # a collapsed body may have normals of any direction, but of length 1
+    # normals of a collapsed body may have any direction, but have length 1
     assert np.allclose(np.linalg.norm(alone, axis=1), 1)
 
 
@@ -142,7 +142,7 @@ def test_a_surface_that_was_not_stored_comes_from_the_embedding(result: Path, tm
 
 
 WRONG = {
-    # on a full disk HDF5 crashed in it
+    # HDF5 crashed here on a full disk
     "unknown format: name the file *.glb, *.usd": ("x.vtkhdf", {}),
     "has frames 0 to 4, not 5": ("x.glb", {"frames": [0, 5]}),
     "a *.obj holds one frame, not 2": ("x.obj", {"frames": [0, 1]}),
@@ -223,7 +223,7 @@ def test_xdmf_is_exact_far_from_the_origin(tmp_path: Path):
 
 
 def stressed(index: int) -> dict[str, np.ndarray]:
-    """Stress of the bar's nodes and cells at a frame."""
+    """Return the stress of the bar's nodes and cells at a frame."""
     rows = {"": len(NODES), "cell_": 2}
     numbers = {
         f"{whose}{name}": index + np.arange(rows[whose]) for whose in rows for name in SCALARS
@@ -234,7 +234,7 @@ def stressed(index: int) -> dict[str, np.ndarray]:
 
 
 def test_stress_comes_with_xdmf(tmp_path: Path):
-    """XDMF has a tensor as two vectors."""
+    """XDMF stores a tensor as two vectors."""
     result = small_result.write(
         tmp_path / "x.h5", [small_result.frame(k, **stressed(k)) for k in range(3)]
     )

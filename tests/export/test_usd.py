@@ -1,4 +1,4 @@
-"""USD files, read back by USD's own library: frames of the result in time, a mesh a body."""
+"""USD's own library reads USD files back: all frames in time, and a mesh for each body."""
 
 from pathlib import Path
 
@@ -25,13 +25,13 @@ def result(tmp_path: Path) -> Path:
 
 
 def opened(path: Path) -> tuple[Usd.Stage, list[UsdGeom.Mesh]]:
-    """Stage and meshes, which live as long as the stage."""
+    """Return the stage and its meshes, which live as long as the stage."""
     stage = Usd.Stage.Open(str(path))
     return stage, [UsdGeom.Mesh(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Mesh)]
 
 
 def points_of(mesh: UsdGeom.Mesh, code: float) -> np.ndarray:
-    """Points (v, 3) in the stage."""
+    """Return the points (v, 3) in the coordinates of the stage."""
     x, y, z = UsdGeom.XformCache(code).GetLocalToWorldTransform(mesh.GetPrim()).ExtractTranslation()
     return np.array(mesh.GetPointsAttr().Get(code)) + np.array([x, y, z])
 
@@ -84,7 +84,7 @@ def test_the_mesh_is_what_usd_asks_for(result: Path, tmp_path: Path):
 
 
 def test_several_bodies_are_a_mesh_each(result: Path, tmp_path: Path):
-    """The small result twice, the second body moving the other way."""
+    """Two bodies, the small result twice, are a mesh each; the second moves the other way."""
     with h5py.File(result, "r+") as file:
         moved = file["frames/surface"][:]
         for name in ("surface/points", "surface/triangles", "frames/surface"):

@@ -1,9 +1,9 @@
-"""A surface filled with cells: cells that it touches or encloses, on any number of ranks.
+"""Filling a surface with cells that it touches or encloses, on any number of ranks.
 
-Touched cells have a separating-axis test in integers as oracle, so nothing is rounded. A cell is
-the half-open box [i, i+1)^3. A cell touched only at its far faces, where it is interpolated, may be
-marked or not. So all cells of the half-open test must be marked, and no cells beyond the closed
-test.
+The reference for touched cells is a separating-axis test in integers, so nothing is rounded. A cell
+is the half-open box [i, i+1)^3. A cell that is touched only at its far faces may be marked or not,
+because rays interpolate there. So all cells of the half-open test must be marked, and no cells
+beyond the closed test.
 """
 
 import os
@@ -51,17 +51,16 @@ def cells_of(corners: np.ndarray, low=(0, 0, 0), high=(SIDE,) * 3) -> set[tuple[
     return set(map(tuple, unpacked(keys).tolist()))
 
 
-# corners of the oracle's triangles are multiples of 1/64
+# corners of the reference triangles are multiples of 1/64
 UNIT = 64
 # a half-open cell ends 1/64 * 2^-34 before its far faces
 FINE = 1 << 34
 
 
 def boxes_touched(triangle: np.ndarray, gap: int) -> set[tuple[int, ...]]:
-    """Separating axes between a triangle (3, 3) in 1/64 cells and all boxes [i, i + 1 - gap / (64 *
-    2^34)].
+    """Return which boxes [i, i + 1 - gap / (64 * 2^34)] a triangle (3, 3) [1/64 cell] touches.
 
-    Akenine-Moller 2001, in integers below 2^63.
+    Separating axes, Akenine-Moller 2001, in integers below 2^63.
     """
     cells = np.stack(np.indices((SIDE,) * 3), -1).reshape(-1, 3)
     low, high = cells * UNIT * FINE, (cells + 1) * UNIT * FINE - gap
@@ -140,7 +139,7 @@ SHAPES = {
 
 
 def enclosed(boundary: np.ndarray) -> np.ndarray:
-    """Return cells that a dense flood fill from outside does not reach, without the boundary."""
+    """Return cells that a dense flood fill from outside does not reach, without boundary cells."""
     label, _ = ndimage.label(np.pad(~boundary, 1, constant_values=True))
     return ((label != label[0, 0, 0]) & (label != 0))[1:-1, 1:-1, 1:-1]
 
@@ -161,8 +160,8 @@ def test_a_cavity_is_filled_but_where_it_is_wound_as_one(turned, boundary):
 
 
 def test_time_and_memory_follow_the_cells_not_the_bounding_box():
-    # a rod of 35,000 x 3 x 3 cells along the diagonal of a grid of 20,000^3: a bit for
-    # each of its cells is 1 TB
+    # a rod of 35,000 x 3 x 3 cells along the diagonal of a grid of 20,000^3; one bit
+    # for each cell of the grid would be 1 TB
     ends = np.array([[0, 0, 0], [20_000, 20_000, 20_000]])
     body = body_of(trimesh.creation.cylinder(radius=1.5, segment=ends, sections=5))
     # compile before the measurement
@@ -172,7 +171,7 @@ def test_time_and_memory_follow_the_cells_not_the_bounding_box():
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert cages.grids.grids[0].shape.min() >= 20_000 and (cages.kind == INTERIOR).sum() > 10_000
-    # bytes; the peak comes while triangles are cut into pieces of 17 sums each
+    # bytes; the peak occurs while triangles are cut into pieces of 17 sums each
     assert peak < 800 * len(cages.kind)
 
 
@@ -198,7 +197,7 @@ def test_an_aligned_box_is_filled_with_its_own_cells():
 
 
 def single(surface: Surface) -> Surface:
-    """As a file of single precision has it."""
+    """Return the mesh with coordinates in single precision, as in a file."""
     return Surface(surface.points.astype(np.float32).astype(float), surface.triangles)
 
 
@@ -216,7 +215,7 @@ def l_shape() -> Surface:
 @pytest.mark.parametrize("shift", [0.0, 0.7, 3.0])
 @pytest.mark.parametrize("shape", ["box", "l"])
 def test_a_size_that_divides_a_body_divides_its_copies_in_single_precision(shape, shift):
-    """Scaled, turned and moved, as in double precision."""
+    """A size that divides a body also divides its scaled, turned and moved copies."""
     mesh = (
         surface_of(trimesh.creation.box(bounds=[[0, 0, 0], [0.3, 0.2, 0.1]]))
         if shape == "box"
@@ -251,13 +250,13 @@ def test_without_its_lid_the_winding_number_fills_the_box():
     assert not body.report.closed
     cages = fill([body], 0.1)
     assert len(cages.kind) == 150
-    # a layer more, because no triangle marks the upper layer as boundary
+    # one layer more, because no triangle marks the upper layer as boundary
     assert (cages.kind == INTERIOR).sum() == 8 * 3 * 2
 
 
 @pytest.fixture(scope="module")
 def filled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Cages]]:
-    """Return the folder with the meshes of the worker, and their cells on a single rank."""
+    """Return the folder with the worker's meshes, and their cells on a single rank."""
     folder, cages = tmp_path_factory.mktemp("filled"), {}
     for name, cell_size in FILLED:
         mesh = SHAPES["one cell" if name == "one cell" else "torus upright"][0].copy()
@@ -290,7 +289,7 @@ def test_too_many_cells_are_refused():
         fill([aligned_box()], 0.1, max_cells=149)
     assert len(fill([aligned_box()], 0.1, max_cells=150).kind) == 150
     with pytest.raises(InputError, match=r"above cages.max_cells"):
-        # the refusal comes at once, without an attempt at 1.5e14 cells
+        # the error comes at once, without an attempt at 1.5e14 cells
         fill([aligned_box()], 1e-5)
     with pytest.raises(InputError, match=r"cages.cell_size: 1e-08 m would cut the body into 1e"):
         fill([aligned_box()], 1e-8)
@@ -305,12 +304,12 @@ def test_too_many_cells_are_refused():
 def test_the_cell_size_gives_the_wanted_number_of_cells(name, count):
     body = body_of(read_surface(MESHES / f"{name}.ply"))
     cages = fill([body], choose_cell_size([body], count))
-    # copies of cells at slits come on top
+    # copies of cells at slits come in addition
     assert len(np.unique(cages.table.keys // COPIES)) == pytest.approx(count, rel=0.01)
 
 
 def test_a_number_that_no_size_gives_is_told_and_the_nearest_taken(caplog):
-    # a cube has its own k^3 cells, and no other number: 8 and 27 lie around 20
+    # a cube has its own k^3 cells and no other number; 20 lies between 8 and 27
     cube = body_of(trimesh.creation.box((1, 1, 1)))
     with caplog.at_level("WARNING", logger="msmpetsc"):
         cages = fill([cube], choose_cell_size([cube], 20))

@@ -1,5 +1,4 @@
-"""Meshes of cells: their boundary is closed and wound outwards, and their sets of cells and points
-are groups."""
+"""Meshes of cells: their boundary is closed and wound outwards, and their sets become groups."""
 
 from itertools import product
 from pathlib import Path
@@ -32,8 +31,7 @@ INVERTED["pyramid"] = [3, 2, 1, 0, 4]
 
 
 def cells_of(kind: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return points and cells of a cube of 1 m, every third cell inverted, and a point that no cell
-    has."""
+    """Return points and cells of a cube of 1 m; every third cell is inverted, a point unused."""
     places: dict[tuple[float, ...], int] = {}
     cells = []
     for corner in product(range(N), repeat=3):
@@ -113,7 +111,7 @@ def test_sets_of_cells_and_points_are_groups(tmp_path: Path):
     meshio.gmsh.write(tmp_path / "x.msh", mesh, "2.2", binary=False)
     groups = read_surface(tmp_path / "x.msh").groups
     assert groups.keys() == {"left", "2", "7", "tip"}
-    # both groups are closed and wound outwards on their common face
+    # on their common face both groups are closed and wound outwards
     for name in ("left", "2"):
         report = examine(groups[name])
         assert report.closed and report.volume == pytest.approx(0.5)
@@ -138,8 +136,10 @@ def test_sets_of_cells_and_points_are_groups(tmp_path: Path):
 
 @pytest.mark.parametrize("end", ["msh", "inp", "bdf", "vtu", "vtk"])
 def test_damaged_files_are_refused_in_one_line(end: str, tmp_path: Path):
-    """Cut short anywhere, or with bytes of garbage: a surface or a line, in bounded time and
-    memory."""
+    """A file cut short anywhere, or with random bytes, gives a surface or a line of error.
+
+    Time and memory are bounded.
+    """
     points, cells = cells_of("tetra")
     path, chance = tmp_path / f"x.{end}", np.random.default_rng(0)
     write(path, meshio.Mesh(points, [("tetra", cells)]))

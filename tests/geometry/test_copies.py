@@ -1,7 +1,7 @@
 """Slits narrower than a cell: parts of cells, their copies, and bodies that open.
 
-Convex bodies need no copies. The lattice of a body must hang together as the body does. A fork is
-compared with theory and with itself on cells that its slit does not fit into.
+Convex bodies need no copies. The lattice is connected as the body is. A fork is compared with
+theory and with finer cells.
 """
 
 from pathlib import Path
@@ -40,7 +40,7 @@ def box(low: list[float], high: list[float]) -> trimesh.Trimesh:
 
 
 def fork(slit: float, shift: float = 0.0) -> trimesh.Trimesh:
-    """A bar with a slit of so many cells from its end to its base."""
+    """Return a bar with a slit of so many cells from its end to its base."""
     middle = WIDTH / 2 + shift
     bar = box([0, 0, 0], [LENGTH, WIDTH, DEPTH])
     gap = box([BASE, middle - slit / 2, -1], [LENGTH + 1, middle + slit / 2, DEPTH + 1])
@@ -50,7 +50,7 @@ def fork(slit: float, shift: float = 0.0) -> trimesh.Trimesh:
 
 
 def folded_sheet(gap: float) -> trimesh.Trimesh:
-    """A sheet folded on itself: two layers of 0.7 cells that hang together at x = 0."""
+    """Return a folded sheet: two layers of 0.7 cells that are connected at x = 0."""
     layers = [
         box([0, 0, 0.13], [12, 4, 0.83]),
         box([0, 0, 0.83 + gap], [12, 4, 1.53 + gap]),
@@ -62,7 +62,7 @@ def folded_sheet(gap: float) -> trimesh.Trimesh:
 
 
 def lips(gap: float) -> trimesh.Trimesh:
-    """A plate of 20 x 8 x 3 cells with an arched slit, which tapers to its closed ends."""
+    """Return a plate of 20 x 8 x 3 cells with an arched slit that tapers to its closed ends."""
     x = np.linspace(-7, 7, 40)
     arch = np.cos(x / 14 * np.pi)
     width = gap * arch / 2 + 0.02
@@ -83,7 +83,7 @@ def cages_of(mesh: trimesh.Trimesh, h: float = H) -> tuple[Cages, Topology]:
 
 
 def components(net: Topology) -> int:
-    """Number of connected parts of a lattice."""
+    """Return the number of connected parts of a lattice."""
     springs = net.springs().ends
     ends = coo_array((np.ones(len(springs)), springs.T), shape=(len(net.ijk),) * 2)
     return connected_components(ends, directed=False)[0]
@@ -104,7 +104,7 @@ CONVEX = {
 
 @pytest.mark.parametrize("name", CONVEX)
 def test_a_convex_body_has_no_copies(name: str):
-    """A cell holds a single part of it, and two of its cells meet in their face."""
+    """A cell holds a single part of a convex body, and neighbouring cells meet in their face."""
     rng = np.random.default_rng(0)
     for turned in (False, True) * 5:
         mesh = CONVEX[name](rng)
@@ -115,7 +115,7 @@ def test_a_convex_body_has_no_copies(name: str):
 
 @pytest.mark.parametrize("seed", range(12))
 def test_a_lattice_hangs_together_as_the_body_does(seed: int):
-    """Unions of boxes, and blocks with holes and slits, which fall into several parts."""
+    """The lattice of boxes and of blocks with holes and slits has as many parts as the body."""
     rng = np.random.default_rng(seed)
     boxes = []
     for _ in range(rng.integers(2, 7)):
@@ -135,7 +135,7 @@ def test_a_lattice_hangs_together_as_the_body_does(seed: int):
 
 @pytest.mark.parametrize(("slit", "shift"), [(0.2, 0.0), (0.4, 0.2), (0.8, 0.0)])
 def test_the_two_parts_of_a_slit_have_their_volumes_and_moments(slit: float, shift: float):
-    """Walls along the grid: both are exact, since the lines across the slit meet both walls."""
+    """With walls along the grid both are exact, since the lines across the slit meet both walls."""
     cages, _ = cages_of(fork(slit, shift))
     ijk = decode_morton(cages.table.keys)
     middle = (ijk[:, 1] == WIDTH // 2) & (ijk[:, 0] > BASE)
@@ -151,14 +151,14 @@ def test_the_two_parts_of_a_slit_have_their_volumes_and_moments(slit: float, shi
 
 
 def test_copies_share_corners_at_the_end_of_the_slit_alone():
-    """Cells at x = BASE have the nodes of the base in common; the nodes beyond are separate."""
+    """Cells at x = BASE share the nodes of the base; all nodes beyond are separate."""
     cages, net = cages_of(fork(0.3))
     ijk = decode_morton(net.keys)
     in_slit = (ijk[:, 1] == WIDTH // 2) & (ijk[:, 2] == 0)
     for i in range(BASE, LENGTH):
         copies = net.cells[in_slit & (ijk[:, 0] == i)]
         volumes = cages.materials_of(net.keys[in_slit & (ijk[:, 0] == i)])[0].mean(axis=1)
-        # the end of the slit lies in the face of the cells: its copy has no volume
+        # the end of the slit is in the face of the cells, so this copy has no volume
         copies = copies[volumes > 0.01]
         shared = np.intersect1d(*copies)
         assert len(copies) == 2
@@ -167,7 +167,7 @@ def test_copies_share_corners_at_the_end_of_the_slit_alone():
 
 
 def test_the_surface_follows_its_own_part(tmp_path: Path):
-    """Each side of the slit moved by itself carries the points of its own wall along."""
+    """If one side of the slit moves, the points of its own wall move along."""
     body = body_of(fork(0.3))
     cages = fill([body], H)
     net = topology_of(cages)
@@ -175,8 +175,8 @@ def test_the_surface_follows_its_own_part(tmp_path: Path):
         weights = embed([body.surface.points], cages, net.table, kind)
         nodes = cages.grids.node_positions(net.ijk)
         np.testing.assert_allclose(weights @ nodes, body.surface.points, atol=1e-6)
-        # nodes beyond the end of the slit are labelled by the prong that their cells
-        # fill
+        # the prong whose cells a node belongs to labels the nodes beyond the end of the
+        # slit
         fills = cages.materials_of(net.keys)[0].mean(axis=1)
         ijk = decode_morton(net.keys)
         side = np.zeros(len(net.ijk))
@@ -195,7 +195,7 @@ def test_the_surface_follows_its_own_part(tmp_path: Path):
 
 
 def pulled(folder: Path, mesh: trimesh.Trimesh, low: list, high: list, **tables: object) -> Path:
-    """A body held at x = 0 whose parts in two boxes are pulled apart, as a static scene."""
+    """Write a static scene: a body held at x = 0, whose parts in two boxes are pulled apart."""
     mesh.export(folder / "body.ply")
     axis = 1 if mesh.extents[2] < 0.25 and mesh.extents[1] > 0.45 else 2
     pull = [0.0, 0.0, 0.0]
@@ -221,7 +221,7 @@ TIPS = [[1.85, -1, -1], [2.1, 0.15, 2]], [[1.85, 0.35, -1], [2.1, 1, 2]]
 
 
 def opening(path: Path, *overrides: str) -> tuple[float, int]:
-    """How far the ends of the prongs move apart [m], and the products with the Hessian."""
+    """Return how far the ends of the prongs move apart [m], and the number of CG iterations."""
     model, frames = play(path, *overrides)
     q = frames[-1].surface
     points = model.surface.points
@@ -233,11 +233,11 @@ def opening(path: Path, *overrides: str) -> tuple[float, int]:
 
 @pytest.mark.parametrize("slit", [0.2, 0.4, 0.8, 1.6])
 def test_a_fork_opens_through_a_narrow_slit(tmp_path: Path, slit: float):
-    """As on cells of half the size, which a slit of 0.8 or 1.6 separates without copies.
+    """A fork opens as on cells of half the size, where slits of 0.8 or 1.6 need no copies.
 
-    Each prong is a cantilever of length l and height b on a base that gives way: two beams give
-    2 F l^3 / (3 E I), the base adds up to a quarter. Glued, the fork opens by 0.1% of it. Multigrid
-    must know the copies: coarse grids that join the prongs take four times as many products.
+    Each prong is a cantilever of length l and height b on a base that yields. Two beams give 2 F
+    l^3 / (3 E I), the base adds up to a quarter. Joined, the prongs open by 0.1% of this. Multigrid
+    must know the copies: coarse grids that join the prongs take four times the iterations.
     """
     path = pulled(tmp_path, fork(slit), *TIPS)
     found, products = opening(path)
@@ -259,7 +259,7 @@ def test_a_fork_is_the_same_on_any_number_of_ranks(tmp_path: Path):
 
 
 def test_two_free_forks_move_as_each_alone(tmp_path: Path):
-    """Multigrid separates free bodies by other keys; their coarse copies follow."""
+    """Coarse copies follow the keys by which multigrid separates free bodies."""
     fork(0.3).export(tmp_path / "fork.ply")
     spin = {"velocity": [0.0, 0.0, 0.0], "spin": [0.0, 0.0, 4.0]}
     scene = {
@@ -283,7 +283,7 @@ def test_two_free_forks_move_as_each_alone(tmp_path: Path):
 
 
 def test_the_surface_drawn_follows_its_own_part(tmp_path: Path):
-    """Triangles longer than a cell are divided; their new points are on their own prong, too."""
+    """Triangles longer than a cell are divided; their new points also follow their own prong."""
     path = pulled(tmp_path, fork(0.4), *TIPS)
     with result_on(1, path) as run:
         name = run.filename
@@ -296,7 +296,7 @@ def test_the_surface_drawn_follows_its_own_part(tmp_path: Path):
 
 
 def sheet_opening(folder: Path, gap: float) -> float:
-    """How far the free ends of a folded sheet move apart [m]."""
+    """Return how far the free ends of a folded sheet move apart [m]."""
     folder.mkdir()
     low, high = [[1.1, -1, 0], [2, 1, 0.09]], [[1.1, -1, 0.1], [2, 1, 1]]
     path = pulled(folder, folded_sheet(gap), low, high)
@@ -308,13 +308,13 @@ def sheet_opening(folder: Path, gap: float) -> float:
 
 
 def test_the_layers_of_a_folded_sheet_move_apart(tmp_path: Path):
-    """Through a gap of a quarter of a cell as through a gap of 1.2 cells, which needs no copies."""
+    """A gap of a quarter of a cell opens like a gap of 1.2 cells, which needs no copies."""
     narrow, wide = (sheet_opening(tmp_path / str(gap), gap) for gap in (0.25, 1.2))
     assert narrow == pytest.approx(wide, rel=0.05)
 
 
 def spiral(thickness: float, gap: float) -> tuple[trimesh.Trimesh, np.ndarray, float]:
-    """A sheet rolled up in 2.5 turns [cells], tilted; the middles of its ends, and its length."""
+    """Return a tilted sheet rolled up in 2.5 turns [cells], the middles of its ends, its length."""
     angle = np.linspace(0, 5 * np.pi, 161)
     along = np.stack([np.cos(angle), np.sin(angle)], 1)
     radius = 1.5 + (thickness + gap) * angle / (2 * np.pi)
@@ -332,7 +332,7 @@ def spiral(thickness: float, gap: float) -> tuple[trimesh.Trimesh, np.ndarray, f
 
 @pytest.mark.parametrize(("thickness", "gap"), [(0.8, 0.1), (1.2, 0.2), (0.6, 0.4)])
 def test_a_rolled_sheet_is_as_long_in_the_lattice(thickness: float, gap: float):
-    """From cell to cell by common nodes, a diagonal a step; joined layers would be a short cut."""
+    """The shortest path along shared nodes is as long as the sheet; joined layers shorten it."""
     body, ends, length = spiral(thickness, gap)
     cages, net = cages_of(body)
     corners = csr_array(
@@ -341,7 +341,7 @@ def test_a_rolled_sheet_is_as_long_in_the_lattice(thickness: float, gap: float):
     middles = cages.grids.node_positions(net.ijk)[net.cells[:, 0]] + H / 2
     near = [np.flatnonzero(np.linalg.norm(middles - end, axis=1) < 0.9 * H) for end in ends]
     steps = shortest_path(corners @ corners.T, unweighted=True, indices=near[0])[:, near[1]]
-    # cells near an end may be of the next layer, so the longest way counts
+    # cells near an end may belong to the next layer, so the longest path counts
     assert np.isfinite(steps).all() and steps.max() > 0.85 * length / np.sqrt(3)
 
 
@@ -349,9 +349,9 @@ def test_a_rolled_sheet_is_as_long_in_the_lattice(thickness: float, gap: float):
 def test_lips_part_along_an_arched_slit(tmp_path: Path, gap: float):
     """The opening agrees with finer cells within 10%.
 
-    A slit of 1.6 cells gives 0.93, for the plate bends. The slit crosses rows of cells. In a grazed
-    cell, a sliver of the lower lip lies between all lines of the search. If it were joined with the
-    upper lip, the lips would part by 0.05.
+    A slit of 1.6 cells gives 0.93, because the plate bends. The slit crosses rows of cells. In a
+    grazed cell a sliver of the lower lip lies between all lines of the search. If it were joined
+    with the upper lip, the lips would part by 0.05.
     """
     held, pulled_side = (
         {"half_space": {"point": [0, s * (4 * H - 1e-3), 0], "normal": [0, s, 0]}} for s in (-1, 1)

@@ -1,5 +1,4 @@
-"""The embedding weights: exactness, continuity, smoothness, accuracy, and a plain evaluation of Eq.
-1-9."""
+"""Embedding weights: exactness, continuity, smoothness, accuracy, and Eq. 1-9 evaluated plainly."""
 
 from itertools import permutations
 
@@ -28,7 +27,7 @@ SMOOTH_KINDS = pytest.mark.parametrize("kind", ["cages", "affine"])
 near_face = st.sampled_from([0.0, 1e-300, 1e-16, 3e-14, 1e-13, 1e-12, 1e-9, 1e-5, 0.00999, 0.01001])
 coordinate = st.one_of(near_face, near_face.map(lambda x: 1 - x), st.just(0.5), st.floats(0, 1))
 local_points = st.tuples(coordinate, coordinate, coordinate)
-# every cell of the block touches the middle cell: any set of them is connected
+# every cell of the block touches the middle cell, so any set of them is connected
 neighbour_masks = st.lists(st.booleans(), min_size=27, max_size=27).map(
     lambda m: [*m[:13], True, *m[14:]]
 )
@@ -46,17 +45,19 @@ def random_masks(rng, count):
 
 
 def exists(masks):
-    """(p,64) bool: the node belongs to a valid cell."""
+    """Return the mask (p,64) of nodes that belong to a valid cell."""
     has_node = ((NODES - BLOCK[:, None] >= 0) & (NODES - BLOCK[:, None] <= 1)).all(-1)
     return masks @ has_node > 0
 
 
-# ---- a plain evaluation of Eq. 1-9, cell by cell, triangle by triangle
+# ---- a direct evaluation of Eq. 1-9, cell by cell, triangle by triangle
 
 
 def surface_triangles(cells):
-    """Outward triangles, as nodes, of a union of cells (set of low corners); squares cut from low
-    to high corner."""
+    """Return outward triangles, as nodes, of a union of cells (set of low corners).
+
+    Squares are cut from low to high corner.
+    """
     triangles = []
     for cell in cells:
         for axis, end in np.ndindex(3, 2):
@@ -70,7 +71,7 @@ def surface_triangles(cells):
 
 
 def plain_mvc(p, cells):
-    """Eq. 2-5 -> (64,); cells: set of low corners."""
+    """Return the weights (64,) of Eq. 2-5; cells: set of low corners."""
     w = np.zeros(64)
     for triangle in surface_triangles(cells):
         e = [(v - p) / np.linalg.norm(v - p) for v in triangle]
@@ -85,7 +86,7 @@ def plain_mvc(p, cells):
 
 
 def plain_cages(p, mask, h):
-    """Eq. 7-9 -> (64,)."""
+    """Return the weights (64,) of Eq. 7-9."""
     valid = {tuple(offset) for offset in BLOCK[mask]}
     corners = [np.array(v) for v in np.ndindex(2, 2, 2)]
     around = {tuple(v): {c for c in valid if all(v - c >= 0) and all(v - c <= 1)} for v in corners}
@@ -155,7 +156,7 @@ def test_rows_sum_to_one_reproduce_linear_fields_and_use_only_nodes_there_are(
 
 @ALL_KINDS
 def test_weights_know_no_direction(kind):
-    """A cut from low to high corner is the same after swapping axes and after point inversion."""
+    """Swapping axes and point inversion change neither the cut of squares nor the weights."""
     rng = np.random.default_rng(2)
     u, masks = rng.random((50, 3)), random_masks(rng, 50)
     found = stencil_weights(kind, u, masks).reshape(50, 4, 4, 4)
@@ -172,42 +173,43 @@ def test_weights_know_no_direction(kind):
 
 
 def neighbours_of(valid, cells):
-    """Return a mask (p,27) of cells (p,3).
+    """Return the mask (p,27) of the valid cells around cells (p,3).
 
-    valid (nx,ny,nz) is bool, with a margin of a cell that is not valid.
+    valid : (nx,ny,nz) bool, with a margin of invalid cells
     """
     return valid[tuple(np.moveaxis(cells[:, None] + BLOCK, -1, 0))]
 
 
 def place(kind, valid, nodes, cells, u):
-    """Embedded points (p,3): valid as above, nodes (nx+1,ny+1,nz+1,3) positions, points at u (p,3)
-    in cells (p,3)."""
+    """Return embedded points (p,3) at u (p,3) in cells (p,3).
+
+    valid : as above
+    nodes : (nx+1,ny+1,nz+1,3) positions
+    """
     weights = stencil_weights(kind, u, neighbours_of(valid, cells))
     around = nodes[tuple(np.moveaxis(cells[:, None] + NODES, -1, 0))]
     return np.einsum("pk,pkx->px", weights, around)
 
 
 def random_cells(rng, shape=(6, 6, 6), share=0.5):
-    """valid with a margin, True at random: cells that touch at faces, at edges, at corners, or
-    nowhere."""
+    """Return a random mask of valid cells with a margin; they touch in all ways or nowhere."""
     return np.pad(rng.random(shape) < share, 1)
 
 
 def moved_nodes(rng, valid):
-    """Grid points, moved at random. [cells]"""
+    """Return the grid points [cells], moved at random."""
     grid = np.moveaxis(np.indices(np.array(valid.shape) + 1), 0, -1).astype(float)
     return grid + MOVED * rng.standard_normal(grid.shape)
 
 
 def bend(X):
-    """The bar (its axis along x) bent to an arc in the x-z plane, about RADIUS below its middle.
-    [m]"""
+    """Return the points [m] after bending to an arc in the x-z plane, RADIUS below the middle."""
     angle, radius = X[..., 0] / RADIUS, RADIUS + X[..., 2] - BAR[2] / 2
     return np.stack([radius * np.sin(angle), X[..., 1], radius * np.cos(angle) - RADIUS], -1)
 
 
 def rms_error(kind, size, points=4000):
-    """rms distance [m] of the embedded points from the bent bar's."""
+    """Return the rms distance [m] of the embedded points from the bent bar."""
     rng = np.random.default_rng(1)
     valid = np.pad(np.ones(np.rint(BAR / size).astype(int), bool), 1)
     nodes = bend((np.moveaxis(np.indices(np.array(valid.shape) + 1), 0, -1) - 1) * size)
@@ -234,8 +236,7 @@ def shared(rng, valid, offsets, points):
 
 
 def position_jump(kind, valid, points=3000):
-    """Greatest distance [cells] between the answers of two cells for a point on a face, edge or
-    corner of both."""
+    """Return the greatest distance [cells] between the results of two cells for a shared point."""
     rng = np.random.default_rng(2)
     nodes = moved_nodes(rng, valid)
     first, second, u = shared(rng, valid, BLOCK[14:], points)
@@ -247,7 +248,7 @@ def position_jump(kind, valid, points=3000):
 def kinks(kind, valid, points=2000):
     """Return the jumps (p,) of the normal derivative across shared faces.
 
-    They are from second-order differences on each side.
+    They come from second-order differences on each side.
     """
     rng = np.random.default_rng(3)
     nodes = moved_nodes(rng, valid)
@@ -263,7 +264,7 @@ def kinks(kind, valid, points=2000):
 @ALL_KINDS
 @pytest.mark.parametrize("share", [0.2, 0.5, 0.9])
 def test_position_is_continuous_across_everything_that_cells_share(kind, share):
-    """Faces, edges and corners of cells that may touch only there."""
+    """Positions are continuous on faces, edges and corners of cells that may touch only there."""
     rng = np.random.default_rng(4)
     valid = random_cells(rng, share=share)
     assert position_jump(kind, valid) < 1e-10

@@ -1,5 +1,4 @@
-"""Shares of cells and of their corners: volumes, first moments, planes, open surfaces, surfaces
-wound both ways."""
+"""Fills of cells and corners: volumes, first moments, planes, open and wrongly wound surfaces."""
 
 import logging
 
@@ -27,9 +26,9 @@ BODIES["hollow"].faces[320:] = BODIES["hollow"].faces[320:, ::-1]
 def columns_of(
     mesh: trimesh.Trimesh, h: float, offset: float = 0.0
 ) -> tuple[Columns, np.ndarray, np.ndarray]:
-    """Return the columns of a mesh in cells of h from ``offset`` cells before it.
+    """Return the columns of a mesh in cells of h, all cells of its box, and their first cell.
 
-    Also return all cells of its box, and their first cell.
+    The grid begins ``offset`` cells before the mesh.
     """
     origin = mesh.bounds[0] - offset * h
     corners = (mesh.vertices - origin)[mesh.faces] / h
@@ -41,8 +40,7 @@ def columns_of(
 @pytest.mark.parametrize("offset", [0.0, 0.3])
 @pytest.mark.parametrize("name", BODIES)
 def test_fills_have_the_bodys_volume_and_its_centre(name: str, offset: float):
-    """Both exactly: the corners' functions sum to 1, and to the position when each is taken times
-    its corner's."""
+    """Both are exact: corner functions sum to 1, and times their corners to the position."""
     mesh, h = BODIES[name], 0.17
     columns, cells, origin = columns_of(mesh, h, offset)
     fills, _ = columns.inside(cells)
@@ -99,7 +97,7 @@ def volume(cages: Cages) -> float:
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_the_longest_side_may_be_any_and_faces_may_be_wound_inwards(axis: int):
-    """Cages cycle the axes, so that the longest side is the first."""
+    """The result does not depend on the cyclic order of axes or on the winding."""
     mesh = trimesh.creation.box(bounds=[[0, 0, 0], np.roll([1.0, 0.53, 0.38], axis)])
     expected = fill([body_of(mesh)], 0.1)
     top = expected.ijk[:, (axis + 2) % 3] == 3
@@ -177,7 +175,10 @@ def test_parts_that_weigh_otherwise_than_the_mesh_are_told(
 
 
 def test_the_body_whose_mass_is_most_off_is_told_once(caplog: pytest.LogCaptureFixture):
-    """Whole cells of 0.2 m: 6^3 around a cube of 1.1 m, 5^3 around a cube of 1 m."""
+    """The warning names the cube whose mass is most off, on whole cells of 0.2 m.
+
+    6^3 cells surround a cube of 1.1 m, 5^3 a cube of 1 m.
+    """
     cubes = [body_of(trimesh.creation.box((side,) * 3)) for side in (1.0, 1.1)]
     box = trimesh.creation.box((1, 1, 1))
     box.update_faces(np.arange(12) > 0)
@@ -195,7 +196,7 @@ def test_the_body_whose_mass_is_most_off_is_told_once(caplog: pytest.LogCaptureF
 
 @pytest.mark.parametrize("excess", [0.015, 0.025])
 def test_a_fiftieth_of_the_mass_is_the_limit(excess: float, caplog: pytest.LogCaptureFixture):
-    """A cube a little shorter than ten whole cells."""
+    """A cube slightly shorter than ten whole cells has a mass just above or below the limit."""
     short = trimesh.creation.box((1, 1, 1 / (1 + excess)))
     fill([body_of(short)], 0.1, boundary="whole")
     assert ("weigh" in caplog.text) == (excess > 0.02)

@@ -1,7 +1,4 @@
-"""Mesh files of all formats, whole, damaged or hostile.
-
-Each gives a mesh of finite points or an error of a line.
-"""
+"""Mesh files of all formats, whole, damaged or hostile, give finite points or a line of error."""
 
 import base64
 import json
@@ -44,7 +41,7 @@ def exported(**options) -> bytes:
 
 
 def by_meshio(kind: str, **options) -> bytes:
-    """As meshio writes it."""
+    """Return the bytes of a mesh in a file that meshio writes."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, f"x.{kind}")
         meshio.Mesh(BOX.vertices, [("triangle", BOX.faces)]).write(path, **options)
@@ -62,7 +59,7 @@ IN_GLTF = BOX.vertices.astype("<f4").tobytes() + BOX.faces.astype("<u4").tobytes
 def gltf(
     uri: str = "data:application/octet-stream;base64," + base64.b64encode(IN_GLTF).decode(),
 ) -> bytes:
-    """With its buffers as text in it, or in another file."""
+    """Return a glTF file with its buffers as text in it, or in another file."""
     tree = {
         "asset": {"version": "2.0"}, "scenes": [{"nodes": [0]}],
         "nodes": [{"children": [1]}, {"mesh": 0, "scale": [1, 2, 1]}],
@@ -107,7 +104,7 @@ SEEDS = [
 
 
 def read(folder: Path, kind: str, content: bytes, *changes: str) -> str:
-    """Return the message of a read, as a scene reads it."""
+    """Read a mesh as a scene does, and return the message; an empty string if there is none."""
     (folder / f"x.{kind}").write_bytes(content)
     (folder / "scene.toml").write_text(SCENE.format(f"x.{kind}"))
 
@@ -139,7 +136,7 @@ def test_a_whole_mesh_is_read_and_a_truncated_one_refused(tmp_path, kind, conten
     assert report.closed and report.volume == pytest.approx(
         {QUADS: 1.0, gltf(): 12.0}.get(content, 6.0)
     )
-    # the remaining lines of an OBJ file may be a mesh
+    # the remaining lines of an OBJ file may still be a mesh
     if not content.startswith((b"v ", b"#", b"mtllib")):
         assert read(tmp_path, kind, content[: len(content) * 3 // 4])
     assert capfd.readouterr() == ("", "")
@@ -170,7 +167,7 @@ def ply(points: int, faces: int, rows: str = "", kind: str = "ascii") -> bytes:
 
 
 def test_polygons_are_cut_into_triangles(tmp_path):
-    """A prism: two triangles, three quads; volume 1/2."""
+    """A prism of two triangles and three quads has the volume 1/2."""
     points = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (0, 1, 1)]
     faces = [(0, 2, 1), (3, 4, 5), (0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5)]
     text_points = [" ".join(map(str, p)) for p in points]
@@ -192,8 +189,7 @@ def test_polygons_are_cut_into_triangles(tmp_path):
 
 
 def box_in_obj(line: str = "{}\n", face: str = "f {} {} {}", first: int = 1) -> str:
-    """A box as an OBJ: each of its lines as ``line`` has it, the first of its points numbered
-    ``first``."""
+    """Return a box as OBJ lines, each passed through ``line``; point numbers begin at ``first``."""
     rows = ["v {} {} {}".format(*point) for point in BOX.vertices]
     rows += [face.format(*corners) for corners in BOX.faces + first]
     return "".join(line.format(row) for row in rows)
@@ -287,7 +283,7 @@ def test_what_crashes_the_repair_library_is_refused_before():
 
 @pytest.fixture(scope="module")
 def opened():
-    """Names of the files that are opened; audit hooks cannot be taken away again."""
+    """Return a list of the files that are opened from now on; audit hooks cannot be removed."""
     names: list[str] = []
     sys.addaudithook(lambda event, given: names.append(str(given[0])) if event == "open" else None)
     return names

@@ -1,5 +1,4 @@
-"""The prepare steps, scaling and placing; slow steps are computed once, and never wrongly taken
-from the cache."""
+"""The prepare steps, scaling and placing; slow steps are cached, and never confused."""
 
 import os
 from pathlib import Path
@@ -115,7 +114,7 @@ def test_repair_tells_how_much_of_the_surface_it_changed(caplog, folder):
         ) == len(said)
     large = Surface(BODY.points, BODY.triangles[450:])
     caplog.clear()
-    # the second time from the cache
+    # the second result comes from the cache
     for _ in range(2):
         prepare(large, ["repair"])
     assert (
@@ -135,7 +134,7 @@ def test_simplify_reduces_and_stays_closed():
 
 
 def test_simplify_mends_what_it_pinches():
-    """Reduced to 10,000 triangles the dragon's surface is left with pinched edges."""
+    """The dragon's surface, reduced to 10,000 triangles, would have pinched edges."""
     pytest.importorskip("pymeshfix")
     dragon = real("dragon.ply")
     reduced = prepare(dragon, [{"simplify": 10000}])
@@ -167,7 +166,7 @@ def test_orient_turns_each_part_outwards_also_loose_and_open_ones():
 
 @given(st.lists(st.booleans(), min_size=7, max_size=7), st.floats(0, 1e7))
 def test_orient_winds_cavities_inwards_and_their_cores_outwards(inwards, shift):
-    """A ball in a ball in a ball, and boxes.
+    """The mesh is a ball in a ball in a ball, and boxes.
 
     A box contains a box, a second box lies over its edge, and a third box is far away.
     """
@@ -186,7 +185,7 @@ def test_orient_winds_cavities_inwards_and_their_cores_outwards(inwards, shift):
 
 
 def test_orient_refuses_a_one_sided_surface():
-    """A Möbius band of five triangles, each sharing two points with the next."""
+    """The mesh is a Möbius band of five triangles, each sharing two points with the next."""
     band = np.array([[i, (i + 1) % 5, (i + 2) % 5] for i in range(5)])
     points = np.random.default_rng(1).random((5, 3))
     with pytest.raises(InputError, match=r"'orient'.*one side only"):
@@ -249,7 +248,7 @@ def test_a_step_that_leaves_nothing_is_an_error():
 
 
 class Step:
-    """A step that counts how often it is computed."""
+    """A step that counts its computations."""
 
     __name__ = "stretch"
 

@@ -1,4 +1,4 @@
-"""Named models: where they are looked for, fetching (from this machine only), the command."""
+"""Named models: search places, download (from this machine only), and the command."""
 
 import hashlib
 import sys
@@ -38,7 +38,7 @@ class QuietHandler(SimpleHTTPRequestHandler):
 
 @pytest.fixture
 def site(tmp_path):
-    """A folder and the address at which a server of this machine shows it."""
+    """Yield a folder, and the address at which a server on this machine serves it."""
     folder = tmp_path / "site"
     folder.mkdir()
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(QuietHandler, directory=folder))
@@ -52,8 +52,10 @@ def site(tmp_path):
 
 @pytest.fixture
 def toy(site, tmp_path, monkeypatch):
-    """Models 'toybox', whose original can be fetched, and 'toyscan', whose original lies in a
-    package; empty places."""
+    """Register 'toybox', whose original can be downloaded, and 'toyscan', from a package.
+
+    All places for meshes are empty.
+    """
     folder, address = site
     (folder / "box.stl").write_bytes(ORIGINAL)
     for name in ("meshes", "packages", "cache"):
@@ -77,7 +79,7 @@ def toy(site, tmp_path, monkeypatch):
 
 
 def install(folder: Path, content: bytes) -> Path:
-    """A package that must not be imported, with a file in it."""
+    """Write a package with a file in it; it must not be imported."""
     path = folder / "packages/toypackage/data/box.ply"
     path.parent.mkdir(parents=True)
     path.write_bytes(content)
@@ -119,7 +121,7 @@ def test_a_name_gives_the_same_surface_wherever_it_is_found(toy):
 
 
 def test_another_file_under_the_name_is_refused(toy):
-    # another version of the package counts as absent
+    # another version of the package counts as missing
     install(toy, ORIGINAL)
     with pytest.raises(InputError, match="comes with a package"):
         locate("toyscan", toy)

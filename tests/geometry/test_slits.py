@@ -1,4 +1,4 @@
-"""Regions and probes at slits narrower than a cell: those of a prong hold nothing of the other."""
+"""Regions and probes at slits narrower than a cell: those on one prong ignore the other prong."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from test_copies import DEPTH, FORCE, LENGTH, WIDTH, YOUNG, H, fork
 
 # the tip of the upper prong begins here [m]
 BEYOND = (LENGTH - 1.5) * H
-# width and shift of slits [cells]: within cells; around a plane of the grid
+# width and shift of slits [cells]: within cells, and around a plane of the grid
 SLITS = [(0.2, 0.0), (0.2, 0.5), (0.4, 0.2)]
 
 
@@ -30,7 +30,7 @@ def upper_tip(middle: float, mesh: trimesh.Trimesh, region: str) -> dict:
 def test_a_force_on_a_prong_leaves_the_other_alone(
     tmp_path: Path, slit: float, shift: float, region: str
 ):
-    """The other prong turns with the base alone, by far less."""
+    """The other prong only turns with the base, by far less."""
     mesh, middle = fork(slit, shift), (WIDTH / 2 + shift) * H
     ends = mesh.triangles_center
     group = (ends[:, 0] > LENGTH * H - 1e-3) & (ends[:, 1] > middle)

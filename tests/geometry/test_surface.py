@@ -1,4 +1,4 @@
-"""Measuring and checking surfaces."""
+"""Measures and checks of surfaces."""
 
 import numpy as np
 import pytest
@@ -10,8 +10,8 @@ from hypothesis.extra.numpy import arrays
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.surface import Surface, check_encloses, examine, first_of_equal
 
-# name: points, triangles, boundary edges, non-manifold edges (from the notes that come
-# with them)
+# name: points, triangles, boundary edges, non-manifold edges (from notes of their
+# authors)
 SIDES = (1.0, 2.0, 3.0)
 
 
@@ -43,7 +43,7 @@ def test_loose_triangles_count_as_closed():
     surface = box()
     loose = Surface(surface.points[surface.triangles].reshape(-1, 3), np.arange(36).reshape(-1, 3))
     assert examine(loose).closed
-    # a triangle with two corners at one place bounds nothing
+    # a triangle with two corners at the same place bounds nothing
     degenerate = Surface(loose.points, np.vstack([loose.triangles, [[0, 1, 0]]]))
     assert examine(degenerate).closed
 

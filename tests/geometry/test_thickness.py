@@ -1,4 +1,4 @@
-"""Thickness by rays: exact bodies, thin walls told, and the bending of strips across the grid."""
+"""Thickness by rays: exact for simple bodies, warnings of thin walls, bending of oblique strips."""
 
 import re
 from collections.abc import Callable
@@ -30,7 +30,7 @@ def thick_body(mesh: trimesh.Trimesh) -> BodySurface:
 
 
 def slab(degrees: float, thickness: float = 0.1) -> trimesh.Trimesh:
-    """A slab of 1 x 1 m, turned about an axis of the grid."""
+    """Return a slab of 1 x 1 m, turned about an axis of the grid."""
     turn = rotation_matrix(np.radians(degrees), (0, 1, 0))
     return trimesh.creation.box((1, 1, thickness)).apply_transform(turn)
 
@@ -67,7 +67,7 @@ def test_the_tenth_and_the_median_of_two_slabs():
 
 
 def test_small_triangles_are_seen():
-    """Cubes of 0.5 mm along a metre, whose triangles are 1e-7 of its square."""
+    """Cubes of 0.5 mm along a metre have triangles of 1e-7 of its square."""
     cube = trimesh.creation.box((5e-4,) * 3)
     row = [cube.copy().apply_translation([x, 0, 0]) for x in np.linspace(0, 1, 50)]
     found = measured(trimesh.util.concatenate(row))
@@ -109,14 +109,16 @@ def test_walls_along_the_grid_are_thin_for_springs_alone(caplog):
 @pytest.mark.parametrize("degrees", [10, 30, 45])
 @pytest.mark.parametrize("thickness", [3, 1.5, 1])
 def test_strips_across_the_grid_that_bend_too_little_are_told(degrees: float, thickness: float):
-    """The estimate is within 0.05, and on the safe side at small angles. The strips of 3 cells at
-    30 and 45 degrees lie within 0.02 of the limit."""
+    """The estimate is within 0.05, and too small at small angles.
+
+    The strips of 3 cells at 30 and 45 degrees are within 0.02 of the limit.
+    """
     strip = trimesh.creation.box((20, 3, thickness))
     found = measured(strip.apply_transform(rotation_matrix(np.radians(degrees), (0, 1, 0))))
     assert found is not None
     told, real = found.bending(1.0, SOLID), bent_strip(thickness, degrees, 0.25)
     assert told == pytest.approx(real, abs=0.05)
     assert told < ENOUGH or real > ENOUGH
-    # a wall of three cells at 30 degrees, and all walls that are thicker across the
-    # grid, will do
+    # a wall of three cells at 30 degrees suffices, and so do walls that are thicker
+    # across the grid
     assert (told >= ENOUGH) == (thickness / np.sin(np.radians(2 * degrees)) > 3.4)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from msmpetsc.errors import InputError
 
-# The trials are the same every time: a fault found here is found again.
+# The trials are the same every time, so a fault found once is found again.
 TRIALS = settings(
     derandomize=True,
     deadline=None,
@@ -21,7 +21,7 @@ TRIALS = settings(
 )
 NUMBERS = [*b"nan inf 1e400 -1 0 1000000000000 18446744073709551616 1e12 x 1/2/3".split(), b""]
 NUMBER = re.compile(rb"[-+]?\d[\d.eE+-]*")
-# limits of time [s] and memory [byte]; a trial takes a hundredth
+# limits of time [s] and memory [byte]; a trial takes a hundredth of them
 SECONDS, BYTES = 10, 2**31
 
 place = st.floats(0, 1, exclude_max=True)
@@ -43,7 +43,7 @@ damage = st.lists(
 
 
 def damaged(content: bytes, changes: list[tuple[str, float, bytes]]) -> bytes:
-    """The bytes after these changes; places are shares of their length, or of their numbers."""
+    """Return the bytes after these changes; places are shares of the length or of the numbers."""
     for kind, where, new in changes:
         at = int(where * len(content))
         if kind == "number" and (found := list(NUMBER.finditer(content))):
@@ -58,7 +58,7 @@ def damaged(content: bytes, changes: list[tuple[str, float, bytes]]) -> bytes:
 
 @contextmanager
 def limits() -> Iterator[None]:
-    """So much time and memory; more than that fails the test."""
+    """Limit time and memory within the context; a test that exceeds a limit fails."""
 
     def too_long(*_):
         raise AssertionError(f"takes more than {SECONDS} s")
@@ -77,9 +77,9 @@ def limits() -> Iterator[None]:
 
 
 def refusal(call: Callable, lines: bool = False) -> str:
-    """Return the message of an InputError of the call; an empty string if the call succeeds.
+    """Return the message of the InputError that a call raises; an empty string if it succeeds.
 
-    The message is a line that a terminal can show.
+    The message must be one line that a terminal can show.
     """
     with limits():
         try:

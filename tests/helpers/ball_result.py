@@ -1,4 +1,4 @@
-"""The result of a ball that falls and leaps, written without a run."""
+"""The result of a ball that falls and leaps, written by formulas without a run."""
 
 from pathlib import Path
 
@@ -29,15 +29,15 @@ normal = [0, 0, 2]
 [gravity]
 acceleration = [0, 0, -9.81]
 """
-# A ball of radius 0.1 m falls, touches the ground, is squashed, leaps and comes to
-# rest: height of its middle [m].
+# height of the middle [m] of a ball of radius 0.1 m that falls, touches the ground, is
+# squashed, leaps and comes to rest
 HEIGHTS = [0.5, 0.45, 0.3, 0.1, 0.07, 0.05, 0.08, 0.2, 0.35, 0.2, 0.1]
 KINETIC = [0, 1, 4, 8, 4, 0, 5, 3, 0, 2, 0]
 ELASTIC = [0, 0, 0, 0, 5, 9, 3, 0.1, 0.1, 0.1, 0]
 
 
 def write_ball(path: Path, scene: str = SCENE) -> Path:
-    """The points of the ball are the nodes, too, which are pinned where the scene has EAST_HELD."""
+    """Write the result; points of the ball are also nodes, pinned if the scene has EAST_HELD."""
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
     rows = len(ball.vertices)
     embedding = csr_array(np.eye(rows))

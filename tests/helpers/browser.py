@@ -1,7 +1,6 @@
-"""A headless Chromium that tests drive by mouse and keys, over its debugging pipe (the Chrome
-DevTools Protocol).
+"""Tests drive a headless Chromium by mouse and keys over its debugging pipe (Chrome DevTools).
 
-The pipe needs no package and no port: messages are JSON that ends in a null byte.
+The pipe needs no package and no port: messages are JSON and end in a null byte.
 """
 
 import base64
@@ -30,10 +29,10 @@ PATIENCE = 30.0
 
 
 class Browser:
-    """A page in a browser of its own; a context, which ends the browser."""
+    """A page in its own browser; as a context it ends the browser."""
 
     def __init__(self, page: Path, size: tuple[int, int] = (600, 700)):
-        """Open a page in a window of so many pixels."""
+        """Open a page in a window of ``width`` x ``height`` pixels."""
         # pipes from the browser and to the browser
         ours, theirs = os.pipe(), os.pipe()
         read, write = (fcntl.fcntl(fd, fcntl.F_DUPFD, 20) for fd in (theirs[0], ours[1]))
@@ -81,7 +80,7 @@ class Browser:
         self._process.wait(PATIENCE)
 
     def _ask(self, method: str, **params: Any) -> dict[str, Any]:
-        """Return the answer to a command. Events of the browser before it are dropped."""
+        """Send a command and return its answer; events of the browser before it are dropped."""
         self._number += 1
         message = {"id": self._number, "method": method, "params": params}
         message |= {"sessionId": self._session} if self._session else {}
@@ -103,7 +102,7 @@ class Browser:
             self._rest += more
 
     def value(self, expression: str) -> Any:
-        """Return the value of an expression of JavaScript in the page."""
+        """Return the value of a JavaScript expression in the page."""
         answer = self._ask(
             "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
         )
@@ -111,14 +110,14 @@ class Browser:
         return answer["result"].get("value")
 
     def until(self, expression: str) -> None:
-        """Wait until an expression is true."""
+        """Wait until a JavaScript expression is true."""
         end = time.monotonic() + PATIENCE
         while not self.value(expression):
             assert time.monotonic() < end, f"it never came that {expression}"
             time.sleep(0.05)
 
     def middle(self, selector: str) -> tuple[float, float]:
-        """Return where the middle of an element is [px]."""
+        """Return the position of the middle of an element [px]."""
         box = f"document.querySelector({json.dumps(selector)}).getBoundingClientRect()"
         x, y = self.value(
             f"(({{ x, y, width, height }}) => [x + width / 2, y + height / 2])({box})"
@@ -131,8 +130,7 @@ class Browser:
     def drag(
         self, start: tuple[float, float], by: tuple[float, float], shift: bool = False
     ) -> None:
-        """Press the left button, move by so many pixels in ten steps, and let go; with the shift
-        key, or without."""
+        """Drag by these pixels in ten steps with the left button, with the shift key or without."""
         held: dict[str, Any] = {"button": "left", "modifiers": 8 if shift else 0}
         self._mouse("mousePressed", *start, buttons=1, clickCount=1, **held)
         for share in np.linspace(0.1, 1, 10):
@@ -142,15 +140,15 @@ class Browser:
         self._mouse("mouseReleased", start[0] + by[0], start[1] + by[1], clickCount=1, **held)
 
     def click(self, at: str | tuple[float, float]) -> None:
-        """Click on an element's middle, or on a point."""
+        """Click on the middle of an element, or on a point."""
         self.drag(self.middle(at) if isinstance(at, str) else at, (0, 0))
 
     def wheel(self, at: tuple[float, float], down: float) -> None:
-        """Turn the wheel by so many pixels downwards."""
+        """Turn the mouse wheel by so many pixels downwards."""
         self._mouse("mouseWheel", *at, deltaX=0, deltaY=down)
 
     def key(self, key: str) -> None:
-        """Press a key and let it go."""
+        """Press and release a key."""
         self._ask("Input.dispatchKeyEvent", type="keyDown", key=key)
         self._ask("Input.dispatchKeyEvent", type="keyUp", key=key)
 

@@ -1,5 +1,4 @@
-"""Whether a surface crosses itself: each edge against each triangle, by signs of volumes, without
-any library of contact."""
+"""Count crossings of a surface: each edge against each triangle, without a contact library."""
 
 from collections.abc import Sequence
 
@@ -18,10 +17,10 @@ def unique_edges(triangles: np.ndarray) -> np.ndarray:
 
 
 def count_crossings(points: np.ndarray, triangles: np.ndarray) -> int:
-    """Return how many pairs of an edge and a triangle without a common corner cross.
+    """Return the number of crossing pairs of an edge and a triangle without a common corner.
 
-    An edge with an end in the triangle's plane, up to rounding, does not cross it: the triangles of
-    a flat face are in a common plane.
+    An edge that ends in the triangle's plane, up to rounding, does not cross it, because the
+    triangles of a flat face are coplanar.
 
     points : (v, 3)
     """
@@ -33,7 +32,7 @@ def count_crossings(points: np.ndarray, triangles: np.ndarray) -> int:
 
 
 def crossings(model: Model, frames: Sequence[Frame], *solids: trimesh.Trimesh) -> int:
-    """Return how many edges cross triangles, of bodies and of solids at rest, over these frames."""
+    """Return the number of edges that cross triangles of bodies and fixed solids in the frames."""
     assert model.surface is not None
     triangles, first = [model.surface.triangles], len(model.surface.points)
     for solid in solids:

@@ -7,7 +7,7 @@ from msmpetsc.solve.nonlinear.step import Stepper
 
 
 class Failing:
-    """Makes the stepper fail at the calls named, as a step that does not converge."""
+    """Patch of the stepper: it fails at the given calls, as a step that does not converge."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, calls: set[int]):
         self.calls, self.count, self.prefixes, step = calls, 0, [], Stepper.step

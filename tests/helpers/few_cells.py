@@ -1,7 +1,7 @@
 """Bending and twist of few cells at small strain, against theory and finite elements.
 
-A problem solves K u = f with the Hessian K at rest. An error is that of a stiffness in torsion, and
-of a deflection elsewhere.
+A problem solves K u = f with the Hessian K at rest. Errors are those of stiffness in torsion, and
+of deflection elsewhere.
 """
 
 import numpy as np
@@ -21,7 +21,7 @@ LENGTH = 10
 
 
 def shares(lattice: Lattice, *axes: int) -> np.ndarray:
-    """Return the weights (n,) of nodes for an integral over given axes of a box of cells."""
+    """Return the weights (n,) of nodes for integrals over some axes of a box of cells."""
     x = lattice.nodes
     ends = np.isclose(x, x.min(axis=0)) | np.isclose(x, x.max(axis=0))
     return np.where(ends[:, axes], 0.5, 1.0).prod(axis=1)
@@ -39,7 +39,7 @@ def solve(lattice: Lattice, fixed: np.ndarray, u: np.ndarray, f: np.ndarray) -> 
 
 
 def clamped(lattice: Lattice, force: np.ndarray) -> float:
-    """Return the deflection of a beam clamped at its low end by a unit force at its high end."""
+    """Return a cantilever's deflection under a unit force; its low end is clamped."""
     x = lattice.nodes - lattice.nodes.min(axis=0)
     end, weight = np.isclose(x[:, 0], x[:, 0].max()), shares(lattice, 1, 2)
     f = np.where(end, weight / weight[end].sum(), 0.0)[:, None] * force
@@ -59,7 +59,7 @@ def torsion_constant(width: float) -> float:
 
 
 def torsion_error(across: int, poisson: float, width: int = 1) -> float:
-    """Return the error of the torsional stiffness of a bar 1 m thick, from two lengths."""
+    """Return the error of the torsional stiffness of a bar 1 m thick, from bars of two lengths."""
     compliance = []
     for length in (3 * width, 6 * width):
         lattice = box((length * across, width * across, across), 1 / across, poisson)
@@ -78,10 +78,10 @@ def torsion_error(across: int, poisson: float, width: int = 1) -> float:
 
 
 def plate_error(through: int, poisson: float, clamp: bool, side: int = 20) -> float:
-    """Return the error of the middle of a square plate of thickness 1 m under a uniform load.
+    """Return the error of the deflection at the middle of a square plate under a uniform load.
 
-    The reference is Mindlin's plate if it is simply supported, else Timoshenko and
-    Woinowsky-Krieger (1959) with the shear of the simply supported plate.
+    The plate has a thickness of 1 m. The reference is Mindlin's plate if it is simply supported.
+    Otherwise it is Timoshenko and Woinowsky-Krieger (1959) with the shear of Mindlin's plate.
     """
     half = side // 2
     lattice = box((half * through, half * through, through), 1 / through, poisson)
@@ -90,7 +90,7 @@ def plate_error(through: int, poisson: float, clamp: bool, side: int = 20) -> fl
     fixed = np.zeros(x.shape, bool)
     edge = low[:, 0] | low[:, 1]
     fixed[:, 2] = edge
-    # symmetry; and a simple support that holds the edge along itself
+    # symmetry, and a simple support that also holds the edge along itself
     fixed[high[:, 0], 0] = fixed[high[:, 1], 1] = True
     fixed[low[:, 0], 1] = fixed[low[:, 1], 0] = True
     if clamp:
@@ -105,7 +105,7 @@ def plate_error(through: int, poisson: float, clamp: bool, side: int = 20) -> fl
 
 
 def twist_error(through: int, poisson: float, side: int = 6) -> float:
-    """Return the error of the twist of a plate of thickness 1 m whose edges twist it.
+    """Return the error of the twist of a plate of thickness 1 m under twisting edge loads.
 
     The displacement k (-y z, -x z, x y) is exact.
     """
@@ -129,7 +129,7 @@ def beam(poisson: float, length: float, width: float, thickness: float) -> float
 
 
 def strip_error(thickness: float, poisson: float, length: int = 20, width: int = 3) -> float:
-    """Return the error of a strip in the middle of a layer of cells of 1 m."""
+    """Return the error of bending of a strip in the middle of a layer of cells of 1 m."""
     mesh = trimesh.creation.box(bounds=np.array([[0, 0, 0], [length, width, thickness]]))
     lattice = lattice_of(mesh, 1.0, poisson=poisson, offset=(0, 0, (1 - thickness) / 2))
     tip = clamped(lattice, np.array([0.0, 0.0, 1.0]))
@@ -139,7 +139,7 @@ def strip_error(thickness: float, poisson: float, length: int = 20, width: int =
 def bent_strip(
     thickness: float, degrees: float, poisson: float | None, length: int = 20, width: int = 3
 ) -> float:
-    """Return how far a strip's ends turn under moments, over the exact solution.
+    """Return the rotation of a strip's ends under moments, over the exact rotation.
 
     Cells have sides of 1 m. The strip is turned about its width, so its wall lies across the grid.
     """
@@ -150,19 +150,19 @@ def bent_strip(
     y, z = (each.ravel() for each in np.meshgrid(width * middles, thickness * middles))
     f = np.zeros_like(lattice.nodes)
     for end in (-0.5, 0.5):
-        # inside by rounding
+        # inside the strip by more than rounding
         face = np.column_stack([np.full(y.size, (1 - 1e-9) * end * length), y, z])
         pull = np.sign(end) * z[:, None] / (z**2).sum() * turn[:3, 0]
         f += spread(lattice, face @ turn[:3, :3].T, pull)
     K = hessian(lattice)
-    # makes the singular K definite; f is in balance
+    # makes the singular K definite; f is in equilibrium
     K = K + 1e-10 * K.diagonal().max() * eye_array(f.size)
     turned = f.ravel() @ factorise(K)(f.ravel())
     return float(turned / (12 * length / (E * width * thickness**3)))
 
 
 def spread(lattice: Lattice, points: np.ndarray, forces: np.ndarray) -> np.ndarray:
-    """Return the forces (n, 3) [N] on nodes that forces at points (p, 3) [m] cause."""
+    """Return the nodal forces (n, 3) [N] equivalent to forces at points (p, 3) [m]."""
     origin, f = lattice.nodes.min(axis=0), np.zeros_like(lattice.nodes)
     grid = np.rint((lattice.nodes - origin) / lattice.cell_size).astype(int)
     number = {tuple(place): node for node, place in enumerate(grid)}
@@ -176,7 +176,7 @@ def spread(lattice: Lattice, points: np.ndarray, forces: np.ndarray) -> np.ndarr
 
 
 def fem_tip(poisson: float) -> float:
-    """Return a clamped beam's tip deflection by a unit force, from quadratic hexahedra."""
+    """Return the tip deflection of a clamped beam under a unit force, by quadratic hexahedra."""
     x = LENGTH * np.linspace(0, 1, 25) ** 1.5
     mesh = skfem.MeshHex.init_tensor(x, np.linspace(0, 1, 5), np.linspace(0, 1, 5))
     basis = skfem.Basis(mesh, skfem.ElementVector(skfem.ElementHex2()), intorder=4)
@@ -189,9 +189,9 @@ def fem_tip(poisson: float) -> float:
 
 
 def cantilever_error(across: int, poisson: float, exact: float | None = None) -> float:
-    """Return the error of a square cantilever, against hexahedra clamped alike.
+    """Return the error of a square cantilever against hexahedra that are clamped alike.
 
-    exact : deflection of the hexahedra, computed if None
+    exact : deflection of the hexahedra; computed if None
     """
     lattice = box((LENGTH * across, across, across), 1 / across, poisson)
     exact = exact or fem_tip(poisson)

@@ -1,9 +1,9 @@
-"""Programs without their start: forks of a process that has imported the package.
+"""Run programs in forks of a process that has already imported the package.
 
-A child is forked for each run and rank. A small run takes 3 s of a core with its start, 0.7 s in a
-fork. Ranks are ranks of a real mpiexec. For each rank it starts a small program, which passes on
-the environment of the rank. By it a forked child joins the remaining ranks. The program ends as the
-child does.
+Each run and rank has its own fork. A small run takes 3 s of a core in a new process, 0.7 s in a
+fork. Ranks are ranks of a real mpiexec: it starts a small program for each rank, which passes on
+the environment of the rank. With this environment a forked child joins the other ranks. The small
+program ends when the child ends.
 """
 
 import ctypes
@@ -24,7 +24,7 @@ from unittest.mock import patch
 
 PROGRAM = "msmpetsc.cli.main"
 SERVER = multiprocessing.get_context("forkserver")
-# the modules that a run imports, except PETSc
+# modules that a run imports, except PETSc
 SERVER.set_forkserver_preload(
     [
         "preloaded", PROGRAM, "msmpetsc.cli.commands.run", "msmpetsc.app.resume",
@@ -37,7 +37,7 @@ read -r status <$OMPI_COMM_WORLD_RANK.status; exit $status"""
 
 
 def started(target: Callable, *given) -> multiprocessing.Process:
-    """A forked process; the server imports its modules from the paths of this process."""
+    """Return a forked process; the server imports its modules from the paths of this process."""
     process = SERVER.Process(target=target, args=given, daemon=True)
     with patch.dict(os.environ, PYTHONPATH=os.pathsep.join(sys.path)):
         process.start()
@@ -47,14 +47,16 @@ def started(target: Callable, *given) -> multiprocessing.Process:
 def run_forked(
     arguments: Sequence[str], environment: Mapping[str, str], timeout: float
 ) -> subprocess.CompletedProcess:
-    """``msmpetsc`` with these arguments, as subprocess.run gives it. Raises
-    subprocess.TimeoutExpired."""
+    """Run ``msmpetsc`` with these arguments and return what subprocess.run returns.
+
+    Raises subprocess.TimeoutExpired.
+    """
     with tempfile.TemporaryDirectory() as folder:
         out, error = Path(folder, "out"), Path(folder, "error")
         child = started(_program, list(arguments), os.getcwd(), dict(environment), (out, error))
         child.join(timeout)
         if child.exitcode is None:
-            # the session, with all processes that the child started
+            # the session, with all processes that the child has started
             os.killpg(child.pid, signal.SIGKILL)
             raise subprocess.TimeoutExpired("msmpetsc", timeout)
         return subprocess.CompletedProcess(
@@ -65,8 +67,10 @@ def run_forked(
 def run_ranks(
     ranks: int, arguments: Sequence[str], environment: Mapping[str, str], timeout: float
 ) -> subprocess.CompletedProcess:
-    """Python with these arguments on so many ranks, as subprocess.run gives it. Raises
-    subprocess.TimeoutExpired."""
+    """Run Python with these arguments on so many ranks and return what subprocess.run returns.
+
+    Raises subprocess.TimeoutExpired.
+    """
     end = time.monotonic() + timeout
     with tempfile.TemporaryDirectory() as folder:
         streams = [Path(folder, name) for name in ("out", "error")]
@@ -89,7 +93,7 @@ def run_ranks(
             finally:
                 mpiexec.kill()
                 for child in children:
-                    # a failure on another rank has ended all ranks
+                    # all ranks end if one fails
                     if child.is_alive():
                         os.killpg(child.pid, signal.SIGKILL)
         return subprocess.CompletedProcess(
@@ -105,7 +109,7 @@ def _environment_of(path: Path, mpiexec: subprocess.Popen, end: float) -> dict[s
 
 
 def _hand_on(children: list, mpiexec: subprocess.Popen, folder: str, end: float) -> None:
-    """Let the program of each rank end with its child's status, until all or mpiexec have ended."""
+    """Pass each child's status to the program of its rank, until all or mpiexec have ended."""
     running = dict(enumerate(children))
     while running and mpiexec.poll() is None:
         if time.monotonic() > end:
@@ -155,7 +159,7 @@ def _program(
 
 
 def enter(folder: str, environment: Mapping[str, str]) -> None:
-    """Make a forked process leader of its own session, with its own environment, and start MPI."""
+    """Make a forked process the leader of its own session, set its environment, and start MPI."""
     os.setsid()
     # undo the handlers inherited from the fork server
     for number in (signal.SIGINT, signal.SIGTERM):

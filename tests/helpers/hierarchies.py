@@ -1,7 +1,6 @@
 """Lattices that are hard for multigrid, on any number of ranks.
 
-Parts of the cycle are dense matrices. Their rows and columns are x, y, z of each node in turn, on
-any number of ranks.
+The parts of a cycle are dense matrices. Their rows and columns are x, y, z of each node in turn.
 """
 
 from collections.abc import Callable, Iterator
@@ -30,7 +29,7 @@ COMM = MPI.COMM_SELF
 
 
 def at(cells: np.ndarray, *first: int) -> np.ndarray:
-    """Cells moved on the grid."""
+    """Return cells moved on the grid."""
     return cells + np.array(first)
 
 
@@ -40,7 +39,7 @@ def l_shape() -> np.ndarray:
 
 
 def tilted_beam(length: int = 9) -> np.ndarray:
-    """Cells near a line that is parallel to no axis."""
+    """Return cells near a line that is parallel to no axis."""
     cells = block(length, length, length)
     along = np.array([3, 2, 1]) / np.sqrt(14)
     away = cells - (cells @ along)[:, None] * along
@@ -48,8 +47,7 @@ def tilted_beam(length: int = 9) -> np.ndarray:
 
 
 def limbs(reach: int = 7) -> np.ndarray:
-    """A cube with an arm along each axis that is a cell thick; none of them begins at an even
-    index."""
+    """Return a cube with an arm along each axis, one cell thick; no arm begins at an even index."""
     arms = [
         at(block(reach, 1, 1), 4, 2, 1),
         at(block(1, reach, 1), 1, 4, 2),
@@ -63,7 +61,7 @@ def box_of_cells(low: list[int], high: list[int], fineness: int) -> np.ndarray:
 
 
 def figure(fineness: int = 1) -> np.ndarray:
-    """A trunk with a head, legs, arms that reach out and a tail."""
+    """Return a trunk with a head, legs, outstretched arms and a tail."""
     parts = [
         ([6, 2, 8], [12, 8, 18]), ([7, 3, 18], [11, 7, 22]), ([7, 4, 0], [9, 6, 8]),
         ([10, 4, 0], [12, 6, 8]),
@@ -73,7 +71,7 @@ def figure(fineness: int = 1) -> np.ndarray:
 
 
 def comb() -> np.ndarray:
-    """Prongs on a back, with gaps of 1, 2, 3 and 4 cells."""
+    """Return prongs on a back, with gaps of 1, 2, 3 and 4 cells."""
     prongs = [at(block(7, 2, 2), 0, y, 1) for y in (1, 4, 8, 13, 19)]
     return at(np.concatenate([*prongs, at(block(1, 21, 2), -1, 0, 1)]), 1, 0, 0)
 
@@ -108,8 +106,8 @@ def build(
     """Return the lattice of some cells.
 
     contrast : factor on the stiffness of cells beyond the middle of x
-    pins     : whether the lowest nodes of x are fixed
-    poisson  : of a solid; None for springs
+    pins     : whether the nodes of lowest x are fixed
+    poisson  : Poisson's ratio of a solid; None for springs
     """
     middle = cells[:, 0].mean()
 
@@ -130,7 +128,7 @@ def build(
 
 
 def heavier(lattice: Lattice, mass: float) -> Lattice:
-    """The same with nodes of this mass [kg]."""
+    """Return the lattice with nodes of this mass [kg]."""
     return replace(lattice, mass=np.full(lattice.owned, mass))
 
 
@@ -139,7 +137,7 @@ def at_rest(nodes: np.ndarray) -> np.ndarray:
 
 
 def twisted(nodes: np.ndarray) -> np.ndarray:
-    """By 2 rad a metre about x, and by a wave: the same on all ranks."""
+    """Return positions after a twist of 2 rad/m about x and a wave, the same on all ranks."""
     x, y, z = (nodes - ORIGIN).T
     q = nodes.copy()
     q[:, 1] = ORIGIN[1] + np.cos(2 * x) * y - np.sin(2 * x) * z
@@ -148,13 +146,12 @@ def twisted(nodes: np.ndarray) -> np.ndarray:
 
 
 def crushed(nodes: np.ndarray) -> np.ndarray:
-    """To a fifth of its height: the true Hessian is indefinite."""
+    """Return positions pressed to a fifth of the height, where the true Hessian is indefinite."""
     return ORIGIN + (twisted(nodes) - ORIGIN) * [1.0, 1.1, 0.2]
 
 
 def turned(nodes: np.ndarray) -> np.ndarray:
-    """By half a rad a metre about an axis along x, and stretched, so that no spring is
-    compressed."""
+    """Return positions after a twist of 0.5 rad/m and a stretch: no spring is compressed."""
     x, y, z = (nodes - ORIGIN - 0.1).T
     angle = 0.5 * x
     across = [np.cos(angle) * y - np.sin(angle) * z, np.sin(angle) * y + np.cos(angle) * z]
@@ -170,14 +167,14 @@ SHAPES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 
 
 def contact_blocks(lattice: Lattice) -> np.ndarray:
-    """Return (owned, 9) [N/m]: a hard push along an oblique normal on every third node."""
+    """Return blocks (owned, 9) [N/m] of a hard push along an oblique normal on every third node."""
     normal = np.array([0.6, 0.0, 0.8])
     touched = lattice.global_numbers[: lattice.owned] % 3 == 0
     return touched[:, None] * 5e4 * np.outer(normal, normal).ravel()
 
 
 class Applied:
-    """A PC as the context of another PC."""
+    """A PC as the Python context of another PC."""
 
     def __init__(self, pc: PETSc.PC):
         self.pc = pc
@@ -187,7 +184,7 @@ class Applied:
 
 
 class Case:
-    """A lattice, and the cycle that is built for the Hessian at positions q."""
+    """A lattice, and the multigrid cycle for the Hessian at positions q."""
 
     def __init__(
         self,
@@ -210,7 +207,7 @@ class Case:
         return 3 * self.unknowns.total
 
     def dense(self, act: Callable[[PETSc.Vec, PETSc.Vec], None], every: int = 1) -> np.ndarray:
-        """Return the matrix, or some columns, of a function into its second vector (collective)."""
+        """Return the matrix of a linear function, or some of its columns (collective)."""
         first = self.multigrid.operator.getOwnershipRange()[0] // 3
         own = np.zeros((3 * self.unknowns.size, self.size))
         for column in range(0, self.size, every):
@@ -224,7 +221,7 @@ class Case:
         return np.concatenate(self.comm.allgather(own))
 
     def hessian(self) -> np.ndarray:
-        """H = M + t^2 (Hessian of E), and of contact where there is: by its products."""
+        """Return the projected Hessian M + t^2 (Hessian of E and contact), by its products."""
         hessian, t2 = TrueHessian(self.unknowns, self.elasticity, self.time_step), self.time_step**2
         hessian.elastic = self.elasticity.hessian_at(self.q, projected=True)
         matrix = self.dense(lambda x, y: hessian.mult(None, x, y))
@@ -241,13 +238,12 @@ class Case:
         return self.dense(self.multigrid.pc.apply)
 
     def interpolation(self, level: int) -> np.ndarray:
-        """P to the ``level``-th coarse grid's finer neighbour; 0 is that from the first coarse grid
-        to the nodes."""
+        """Return P from the ``level``-th coarse grid to the next finer grid, for 0 to the nodes."""
         rows = self.multigrid.levels[level].interpolation.rows().toarray()
         return np.kron(np.concatenate(self.comm.allgather(rows)), np.eye(3))
 
     def level(self, level: int) -> np.ndarray:
-        """The matrix of a coarse level, on every rank."""
+        """Return the matrix of a coarse level, on every rank."""
         blocks = self.multigrid.coarse_blocks(self.q, self.blocks)[level]
         pattern = self.multigrid.levels[level].pattern
         begin, columns, _ = pattern.getValuesCSR()
@@ -256,8 +252,11 @@ class Case:
         return np.concatenate(self.comm.allgather(own))
 
     def iterations(self, rtol: float, rough: bool) -> int:
-        """CG's on the true Hessian with the cycle, to this tolerance in the norm of the error, as
-        newton's; of a step under weight, or of pushes that differ from node to node."""
+        """Return the number of CG iterations with the true Hessian and the cycle, as in newton.
+
+        rtol  : tolerance of the error in the natural norm
+        rough : whether the load varies from node to node; otherwise it is a weight
+        """
         hessian = TrueHessian(self.unknowns, self.elasticity, self.time_step)
         hessian.linearise(self.q, None)
         operator = python_matrix(self.unknowns, hessian, self.comm)
@@ -296,7 +295,7 @@ def hierarchy(
     contact: bool = False,
     coarsest: int = 800,
 ) -> Iterator[Case]:
-    """Return the cycle of the presets, whose coarsest grid has at most ``coarsest`` nodes."""
+    """Yield the cycle of the presets; its coarsest grid has at most ``coarsest`` nodes."""
     database, before = PETSc.Options(), cycle.COARSEST
     for name, value in LATTICE_MULTIGRID.items():
         database.setValue(name, value)

@@ -1,7 +1,7 @@
 """Bars of layers, along the grid and askew, against quadratic finite elements in the plane.
 
-Poisson's ratio is 0, so the plane's solution is that of the bar. Run as a script it prints a table
-of errors for `scripts/results/solid.md`.
+Poisson's ratio is 0, so the plane's solution is that of the bar. Run as a script it prints the
+table of errors in `scripts/results/solid.md`.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,8 @@ from skfem.helpers import ddot, grad, transpose
 from small_strain import SPRINGS
 from solid_runs import E, run
 
-# length [m] of a bar 1 m thick, from its clamp to its stiff cap; its ends beyond them
+# length [m] of a bar 1 m thick between its clamp and its stiff cap, and the length of
+# both ends
 LENGTH, END = 8.0, 1.0
 # small traction on the cap [Pa]
 PULL = 1e-2
@@ -26,8 +27,8 @@ PULL = 1e-2
 class Bar(NamedTuple):
     """A bar of layers of E and of ``ratio`` E.
 
-    edges : heights z of the interfaces [m], or places x if the layers are along; E is below the
-            first, then the layers alternate. Clamp and cap are of ratio E.
+    edges : heights z of the interfaces [m], or x if ``along``. The first layer has E, then layers
+            alternate. Clamp and cap have ratio E.
     along : whether the layers follow each other along the bar
     """
 
@@ -69,7 +70,7 @@ def error(bar: Bar, degrees: float, across: int, poisson: float | None = 0.0) ->
     """Return the relative error of the stiffness of a bar turned in the plane of its layers.
 
     across  : cells across the bar
-    poisson : of the solid; SPRINGS for springs
+    poisson : Poisson's ratio of the solid; SPRINGS for springs
     """
     turn = Rotation.from_euler("y", degrees, degrees=True)
     mesh = trimesh.creation.box(bounds=[[-END, 0, 0], [LENGTH + END, 1, 1]])

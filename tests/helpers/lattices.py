@@ -1,4 +1,4 @@
-"""Lattices of a few cells, a mass on a spring, and a beam that swings."""
+"""Lattices of a few cells, a mass on a spring, and a swinging beam."""
 
 from itertools import product
 
@@ -39,7 +39,7 @@ def block(*sides: int) -> np.ndarray:
 
 
 def beam() -> Lattice:
-    """8 x 2 x 2 cells of 0.1 m, clamped at its low end."""
+    """Return a lattice of 8 x 2 x 2 cells of 0.1 m, clamped at its low end."""
     lattice = build_lattice(
         cages_of(block(8, 2, 2), 0.1), Material(density=1000, young_modulus=2e5, law="linear")
     )
@@ -51,7 +51,7 @@ def weight(lattice: Lattice) -> np.ndarray:
 
 
 def swing(preset: str, steps: int, lattice: Lattice | None = None, **settings) -> list:
-    """The steps of a beam let go under its weight."""
+    """Return the steps of a beam released under its weight."""
     lattice = lattice or beam()
     stepper = Stepper(COMM, lattice, T, find_preset(preset), **settings)
     stepper.set_up()
@@ -67,7 +67,7 @@ def swing(preset: str, steps: int, lattice: Lattice | None = None, **settings) -
 
 
 def dense_hessian(elasticity: Elasticity, q: np.ndarray, projected: bool = False) -> np.ndarray:
-    """The Hessian (3n, 3n) of an elastic energy at q (n, 3), by its products."""
+    """Return the Hessian (3n, 3n) of an elastic energy at q (n, 3), by its products."""
     hessian, columns = elasticity.hessian_at(q, projected), []
     for unit in np.eye(q.size):
         columns.append(np.zeros_like(q))
@@ -76,18 +76,17 @@ def dense_hessian(elasticity: Elasticity, q: np.ndarray, projected: bool = False
 
 
 def one_spring(m: float, k: float, r: float) -> Lattice:
-    """A mass on a spring along z from a pinned end."""
+    """Return a mass on a spring along z, whose other end is pinned."""
     return _in_line(r, m, k, r, [True, False])
 
 
 def chain(m: float, k: float, r: float) -> Lattice:
-    """Masses 1 apart along z, joined by springs of rest length r, the first and the last of the
-    four pinned."""
+    """Return four masses 1 apart, joined by springs of rest length r; both ends are pinned."""
     return _in_line(1.0, m, k, r, [True, False, False, True])
 
 
 def _in_line(apart: float, m: float, k: float, r: float, pinned: list[bool]) -> Lattice:
-    """Masses along z, each joined to the next."""
+    """Return masses along z, each joined to the next."""
     numbers = np.arange(len(pinned))
     count = len(pinned) - 1
     return Lattice(

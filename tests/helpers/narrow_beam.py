@@ -1,7 +1,7 @@
 """A narrow cantilever that buckles sideways under a dead load at its end.
 
-Lattices stand beside quadratic hexahedra of the same law and a Kirchhoff rod. Run as a script it
-prints the figures of `scripts/results/solid.md`.
+Lattices are compared with quadratic hexahedra of the same law and with a Kirchhoff rod. Run as a
+script it prints the figures of `scripts/results/solid.md`.
 """
 
 from collections.abc import Callable
@@ -19,27 +19,28 @@ from small_strain import NU, SHEAR, E, box, factorise, hessian
 
 from msmpetsc.elasticity.energy import Elasticity
 
-# along x, y and z [m]
+# sides along x, y and z [m]
 LENGTH, WIDTH, HEIGHT = 20.0, 0.5, 2.0
 # E I sideways and downwards, G J [N m^2]
 SIDE, DOWN = E * HEIGHT * WIDTH**3 / 12, E * WIDTH * HEIGHT**3 / 12
 TWIST = SHEAR * torsion_constant(HEIGHT / WIDTH) * WIDTH**4
-# Critical load [N] of a slender cantilever (Timoshenko and Gere 1961, 6.4), with the
-# correction of a beam bent by couples at its ends
+# Critical load [N] of a slender cantilever (Timoshenko and Gere 1961, 6.4), corrected
+# as for a beam bent by couples
 TEXTBOOK = 4.0126 * np.sqrt(SIDE * TWIST / (1 - SIDE / DOWN) / (1 - TWIST / DOWN)) / LENGTH**2
-# the load sideways over the load [-]
+# sideways load over the load [-]
 ASIDE = 1e-3
-# By hexahedra, to 0.1%: the critical load over TEXTBOOK [-], and how far 0.9 of
-# TEXTBOOK moves the end sideways [m]
+# by hexahedra, to 0.1%: critical load over TEXTBOOK [-], sideways displacement [m] of
+# the end under 0.9 of TEXTBOOK
 CRITICAL, SIDEWAYS = 1.072, 0.0784
-# by hexahedra: length [m] that does not twist, since the clamp holds the warping
+# by hexahedra: length [m] at the clamp that does not twist, since the clamp holds the
+# warping
 HELD = 0.383
-# change of the last Newton iteration [m]; most iterations
+# change [m] that ends Newton's method; most iterations
 SMALL, MOST = 1e-9, 30
 
 
 class Beam(Protocol):
-    """A discrete beam: nodes (n, 3) [m], and the share (n,) of each in a load on the end."""
+    """A discrete beam: nodes (n, 3) [m], and their shares (n,) of a load on the end."""
 
     nodes: np.ndarray
     share: np.ndarray
@@ -123,7 +124,7 @@ class Hexahedra:
 
 
 def solver(beam: Beam, u: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the function of forces (n, 3) to small displacements (n, 3) beside u."""
+    """Return the function from forces (n, 3) to small displacements (n, 3) beside u."""
     free = np.repeat(~np.isclose(beam.nodes[:, 0], 0), 3)
     inverse = factorise(beam.stiffness(u)[free][:, free])
 
@@ -136,7 +137,7 @@ def solver(beam: Beam, u: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def loaded(beam: Beam, load: float, aside: float = 0.0, u: np.ndarray | None = None) -> np.ndarray:
-    """Return the displacements (n, 3) under loads [N] down and sideways, found from u."""
+    """Return the displacements (n, 3) under loads [N] down and sideways, by Newton from u."""
     f = beam.share[:, None] * [0, aside, -load]
     u = np.zeros_like(f) if u is None else u
     for _ in range(MOST):
@@ -148,7 +149,7 @@ def loaded(beam: Beam, load: float, aside: float = 0.0, u: np.ndarray | None = N
 
 
 def sideways(beam: Beam, load: float) -> float:
-    """Return how far the end goes sideways [m] under a load [N] and ASIDE of it sideways."""
+    """Return the sideways displacement [m] of the end under a load [N] and ASIDE of it sideways."""
     u = None
     for part in (0.4, 0.8, 1.0):
         u = loaded(beam, part * load, ASIDE * part * load, u)
@@ -156,9 +157,9 @@ def sideways(beam: Beam, load: float) -> float:
 
 
 def critical(beam: Beam) -> float:
-    """Return the load [N] at which a small force sideways meets no resistance.
+    """Return the load [N] at which a small sideways force meets no resistance.
 
-    Interpolated, for Newton's method knows no side at the critical load itself.
+    It is interpolated, because Newton's method is singular at the critical load itself.
     """
     u = loaded(beam, 0.5 * TEXTBOOK)
     sideways = beam.share[:, None] * [0, 1, 0]
@@ -170,7 +171,7 @@ def critical(beam: Beam) -> float:
 
 
 def shortening(beam: Beam) -> float:
-    """Return the length [m] near the clamp that does not twist, as the clamp holds its warping."""
+    """Return the length [m] at the clamp that does not twist, as the clamp holds its warping."""
     arm = beam.nodes - [0, WIDTH / 2, HEIGHT / 2]
     u = solver(beam, np.zeros_like(arm))(beam.share[:, None] * np.cross([1, 0, 0], arm))
     turns = []
@@ -188,7 +189,7 @@ def shortening(beam: Beam) -> float:
 def clamp_of(
     tip: np.ndarray, load: float, aside: float, held: float, GJ: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rotation (3, 3) of a rod's clamp and its place (3,), seen from its tip.
+    """Return the rotation (3, 3) and position (3,) of a rod's clamp relative to its tip.
 
     tip  : rotation vector (3,) of the tip
     held : length [m] at the clamp that does not twist
@@ -211,7 +212,7 @@ def clamp_of(
 
 
 def rod_critical(held: float = 0.0, GJ: float = TWIST) -> float:
-    """Return the load [N] at which a rod of inextensible axis, bent by it, has a second state."""
+    """Return the load [N] at which an inextensible rod, bent by this load, has a second state."""
 
     def determinant(load: float) -> float:
         def clamp(*tip: float) -> np.ndarray:
@@ -226,7 +227,7 @@ def rod_critical(held: float = 0.0, GJ: float = TWIST) -> float:
 
 
 def rod_sideways(load: float, held: float = 0.0, GJ: float = TWIST) -> float:
-    """Return how far a rod's end goes sideways [m] under a load [N] and ASIDE of it sideways."""
+    """Return how far a rod's end goes sideways [m] under a load [N] and ASIDE of it."""
 
     def turned(tip: np.ndarray) -> list[float]:
         R = clamp_of(tip, load, ASIDE * load, held, GJ)[0]

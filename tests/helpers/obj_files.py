@@ -7,7 +7,7 @@ import trimesh
 
 
 def write_obj(path: Path, mesh: trimesh.Trimesh, groups: dict[str, np.ndarray]) -> None:
-    """Write a mesh with the faces of each group, by a mask."""
+    """Write a mesh with the faces of each group, given by a mask."""
     lines = [f"v {x} {y} {z}" for x, y, z in mesh.vertices] + ["o block"]
     for name, own in groups.items():
         lines += [f"g {name}", f"usemtl paint of {name}"]

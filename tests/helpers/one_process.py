@@ -1,4 +1,4 @@
-"""Many commands in a process, and the lines of error in their output."""
+"""Run many commands in one process, and find the lines of error in their output."""
 
 import contextlib
 import io
@@ -34,10 +34,10 @@ Answers = list[tuple[int, str]]
 
 
 def answers_on(ranks: int, commands: Sequence[Sequence[object]]) -> list[Answers]:
-    """Return the answers to each of these commands, which a process a rank carries out.
+    """Return the status and message of each rank for each command, all run by one process a rank.
 
-    No PETSc object is left to Python's collector: at its end PETSc waits for objects that a single
-    rank has collected.
+    No PETSc object is left to Python's collector, because at its end PETSc waits for objects that
+    only one rank has collected.
     """
     words = [[*map(str, command)] for command in commands]
     done = run(ranks, "-c", IN_ONE_PROCESS, json.dumps(words), status=0)
@@ -48,7 +48,7 @@ def answers_on(ranks: int, commands: Sequence[Sequence[object]]) -> list[Answers
 
 
 def refusal_in(answers: Answers) -> str:
-    """Return the line of a single rank with which all ranks refuse a command."""
+    """Return the line, from a single rank, with which all ranks refuse a command."""
     assert all(status == 2 for status, _ in answers), answers
     (line,) = (line for _, told in answers for line in told.splitlines() if not is_aside(line))
     assert errors(answers[0][1]) == [line], answers
@@ -56,7 +56,7 @@ def refusal_in(answers: Answers) -> str:
 
 
 def is_aside(line: str) -> bool:
-    """Return whether a line is a note, or tells that two cells of springs are thin."""
+    """Return whether a line is a note, or warns that two cells of springs are thin."""
     return "note:" in line or "is so thin" in line
 
 
@@ -68,7 +68,7 @@ NOISE = ("Traceback", "PETSC ERROR", "MPI_ABORT", "ORTE_ERROR", "Segmentation", 
 
 
 def assert_one_line(done: subprocess.CompletedProcess, status: int, *words: str) -> None:
-    """Assert that a command ended cleanly, with this status and a line that holds these words."""
+    """Assert that a command ended with this status and a single line that contains these words."""
     told = done.stdout + done.stderr
     (line,) = errors(done.stderr)
     assert done.returncode == status and all(word in line for word in words), told
@@ -76,12 +76,12 @@ def assert_one_line(done: subprocess.CompletedProcess, status: int, *words: str)
 
 
 def status_of(*arguments: object) -> int:
-    """Return the exit status of a command, carried out in this process."""
+    """Run a command in this process and return its exit status."""
     return main([*map(str, arguments)])
 
 
 def command_error(*arguments: object) -> str:
-    """Return the line of error with which a command ends, status 2. Notes may precede it."""
+    """Return the line of error of a command that ends with status 2; notes may precede it."""
     stream = io.StringIO()
     with contextlib.redirect_stderr(stream):
         status = status_of(*arguments)
@@ -95,7 +95,7 @@ def command_error(*arguments: object) -> str:
 
 
 def input_error(call: Callable[[], object]) -> str:
-    """Return the message of the InputError of a call, a single line."""
+    """Return the message of the InputError that a call raises, a single line."""
     with pytest.raises(InputError) as raised:
         call()
     assert "\n" not in str(raised.value)

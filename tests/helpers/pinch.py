@@ -1,4 +1,4 @@
-"""A tube bent to a U whose arms close on each other: a mesh, and a scene of it."""
+"""The mesh and the scene of a tube bent to a U whose arms close on each other."""
 
 from pathlib import Path
 
@@ -6,7 +6,8 @@ import numpy as np
 import tomli_w
 import trimesh
 
-# radius of the tube, length of its straight arms, their distance from the U's axis [m]
+# radius of the tube, length of its straight arms, distance of the arms from the U's
+# axis [m]
 RADIUS, ARM, HALF = (
     0.02,
     0.12,
@@ -15,7 +16,7 @@ RADIUS, ARM, HALF = (
 
 
 def u_tube(around: int = 16, along: int = 60) -> trimesh.Trimesh:
-    """Return a closed tube along a U in the plane y = 0: its arms point up, its bend is below."""
+    """Return a closed tube along a U in the plane y = 0: the arms point up, the bend is below."""
     lengths = np.array([ARM, np.pi * HALF, ARM])
     s = np.linspace(0, lengths.sum(), along)
     angle = np.clip((s - ARM) / HALF, 0, np.pi)
@@ -46,8 +47,7 @@ def u_tube(around: int = 16, along: int = 60) -> trimesh.Trimesh:
 
 
 def pinch_scene(folder: Path, **tables: dict) -> Path:
-    """Return a scene file of it: forces close its arms; ``tables`` are added to it, or take a
-    table's place."""
+    """Write the tube's scene; forces close its arms. ``tables`` replace or extend its tables."""
     u_tube().export(folder / "u.ply")
     upper = {"relative": True}
     left = {"box": [[0, 0, 0.7], [0.3, 1, 1]]} | upper

@@ -1,4 +1,4 @@
-"""First import of the fork server (forked.py): keep MPI from starting in it, and prepare numba."""
+"""First import of the fork server (forked.py): it keeps MPI from starting, and prepares numba."""
 
 import mpi4py
 from numba.core.registry import cpu_target

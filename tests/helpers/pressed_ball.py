@@ -1,6 +1,6 @@
-"""A ball pressed by a rigid plate: lattices, and quadratic finite elements of the section.
+"""A ball pressed by a rigid plate, by lattices and by quadratic finite elements of its section.
 
-Run as a script it prints the forces for `scripts/results/contact.md`.
+Run as a script it prints the forces in `scripts/results/contact.md`.
 """
 
 from typing import Any
@@ -16,12 +16,11 @@ from solid_runs import held, run
 # Young's modulus [Pa], Poisson's ratio, Lame's parameters [Pa]; the radius is 1 m
 E, NU = 1e6, 0.3
 MU, LAMBDA = E / (2 * (1 + NU)), E * NU / ((1 + NU) * (1 - 2 * NU))
-# the change of a Newton iteration that ends it [m]
-# the most iterations and changes of the contact
+# change [m] that ends Newton's method; most iterations, and most changes of the contact
 SMALL, MOST = 1e-9, 60
-# how far the plate is pressed in, and the gap before a barrier's plate [m]
+# depth of the plate, and gap before a barrier's plate [m]
 DEPTH, GAP = 0.02, 0.005
-# the force [N] of the section's finite elements at DEPTH
+# force [N] at DEPTH by the section's finite elements
 ELEMENTS = 4387.0
 
 
@@ -31,7 +30,7 @@ def hertz(depth: float) -> float:
 
 
 def section(depth: float, edge: float) -> skfem.MeshTri:
-    """Return a quarter of the disc x² + y² ≤ 1 with edges [m] of ``edge`` around (0, 1)."""
+    """Return a quarter of the disc x² + y² ≤ 1, with edges [m] of ``edge`` around (0, 1)."""
     sides, size = [0.0], edge
     while sides[-1] < np.pi / 2:
         sides.append(sides[-1] + size)
@@ -47,7 +46,7 @@ def section(depth: float, edge: float) -> skfem.MeshTri:
 
 
 def _deformation(grad, radial, radius):
-    """Return F_rr, F_rz, F_zr, F_zz, the stretch around, and the minors that give dJ / dF."""
+    """Return F_rr, F_rz, F_zr, F_zz, the hoop stretch, and the minors for dJ / dF."""
     a, b, c, d = 1 + grad[0, 0], grad[0, 1], grad[1, 0], 1 + grad[1, 1]
     around = 1 + radial / radius
     minors = d * around, -c * around, -b * around, a * around, a * d - b * c
@@ -55,7 +54,7 @@ def _deformation(grad, radial, radius):
 
 
 def _rates(v, radius):
-    """Return the rates of the five entries of F with a displacement."""
+    """Return the derivatives of the five entries of F by a displacement."""
     return v.grad[0, 0], v.grad[0, 1], v.grad[1, 0], v.grad[1, 1], v[0] / radius
 
 
@@ -93,9 +92,9 @@ def _stiffness(u, v, w):
 
 
 def force(depth: float, edge: float, loads: int = 2) -> float:
-    """Return the force [N] of a frictionless plate that is pressed in by a depth [m].
+    """Return the force [N] of a frictionless plate pressed in by a depth [m].
 
-    Surface nodes that would cross the plate are held at it, and let go if it would pull them.
+    Surface nodes that would cross the plate are fixed to it, and released if it would pull them.
     """
     mesh = section(depth, edge)
     basis = skfem.Basis(mesh, skfem.ElementVector(skfem.ElementTriP2()), intorder=5)
@@ -148,7 +147,7 @@ def octant(edge: float) -> trimesh.Trimesh:
 
 
 def lattice_force(cells: int, mesh: trimesh.Trimesh, response: str, **contact: Any) -> float:
-    """Return the force [N] of a plate on a lattice with ``cells`` cells a radius.
+    """Return the force [N] of a plate on a lattice with ``cells`` cells per radius.
 
     contact : ``stiffness`` of the penalty, or ``distance`` of the barrier
     """
@@ -165,7 +164,7 @@ def lattice_force(cells: int, mesh: trimesh.Trimesh, response: str, **contact: A
     else:
         path = [{"time": 1, "by": [0, 0, -DEPTH - GAP]}]
         plate = {"shape": "box", "box": [[-0.5, -0.5, 1 + GAP], [1.5, 1.5, 1.5]], "path": path}
-        # light, and led slowly: at the end the ball is at rest
+        # light, and pressed slowly, so that the ball is at rest at the end
         tables = {
             "obstacle": [plate | {"response": response}],
             "self_contact": contact,

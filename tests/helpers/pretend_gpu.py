@@ -1,8 +1,7 @@
-"""A pretended GPU: arrays in CPU memory that behave towards NumPy's as CuPy's do.
+"""A pretended GPU: arrays in CPU memory that behave towards NumPy's arrays as CuPy's do.
 
-Bodies of kernels run index by index. Mixing of arrays is an error, and copies between machines are
-counted. Like CuPy's, these arrays refuse to become NumPy's unasked, and to be computed with
-together with them.
+Bodies of kernels run index by index. Like CuPy's, these arrays raise if they are mixed with NumPy's
+arrays or converted to them implicitly. Copies between the devices are counted.
 """
 
 import sys
@@ -24,7 +23,7 @@ KNOWN = [
     "empty_like",
     "flatnonzero", "linalg.norm", "nonzero", "tile", "vdot", "where", "zeros", "zeros_like",
 ]  # fmt: skip
-# most numbers of an array that does not grow with a body
+# most numbers in an array that does not grow with a body
 FEW = 9
 counted = Counter()
 
@@ -39,7 +38,7 @@ def name_of(function) -> str:
 
 
 class Array(NDArrayOperatorsMixin):
-    """CuPy's array, as far as steps know it."""
+    """CuPy's array, as far as the steps use it."""
 
     __array_priority__ = 100
 
@@ -96,7 +95,7 @@ class Array(NDArrayOperatorsMixin):
 
     @property
     def __cuda_array_interface__(self) -> dict:
-        """By which PETSc is given an array's address."""
+        """Address of the array, as PETSc asks for it."""
         return self.values.__array_interface__
 
     shape, size, nbytes, dtype, T = (
@@ -132,7 +131,7 @@ for _name in (
 
 
 def bare(value):
-    """Return the values of the array. NumPy's own arrays are refused."""
+    """Return the values of the array; raise for NumPy's own arrays."""
     if isinstance(value, Array):
         return value.values
     if isinstance(value, np.ndarray) and value.ndim:
@@ -143,14 +142,14 @@ def bare(value):
 
 
 def dressed(value):
-    """CuPy's sums and products are arrays of no dimension, not numbers."""
+    """Return a result as CuPy's: sums and products are arrays without dimensions, not numbers."""
     if isinstance(value, tuple):
         return tuple(map(dressed, value))
     return Array(np.asarray(value)) if isinstance(value, (np.ndarray, np.generic)) else value
 
 
 class Memory(device.Memory):
-    """PETSc's, of the CPU, looked at through arrays of the GPU."""
+    """PETSc's memory on the CPU, seen as arrays of the GPU."""
 
     def read(self, vector: PETSc.Vec) -> Array:
         return Array(super().read(vector))
@@ -174,7 +173,7 @@ def launcher(body):
 
 
 def compiled(body):
-    """The CPU's form of a body, which ``kernel`` has made already."""
+    """Return the CPU's form of a body, which ``kernel`` has made already."""
     return getattr(__import__(body.__module__, fromlist=["_"]), body.__name__).compiled
 
 
@@ -187,7 +186,7 @@ def send(array: np.ndarray) -> Array:
 def module(name: str, **contents) -> Iterator[None]:
     """Replace a module by a stand-in of this name.
 
-    patch.dict would forget all modules imported meanwhile.
+    patch.dict would also forget modules imported in the meantime.
     """
     before = sys.modules.get(name)
     sys.modules[name] = SimpleNamespace(**contents)
@@ -199,7 +198,7 @@ def module(name: str, **contents) -> Iterator[None]:
 
 @contextmanager
 def pretended(launch=launcher) -> Iterator[Counter]:
-    """Compute runs within on this GPU; yield the counts.
+    """Make runs within the context compute on this GPU; yield the counts.
 
     launch : backend.launcher.launcher
     """

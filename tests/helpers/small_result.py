@@ -1,4 +1,4 @@
-"""A small result file for tests of readers: a bar of two cells whose frames are formulas."""
+"""A small result file for tests of readers: a bar of two cells whose frames follow formulas."""
 
 from pathlib import Path
 
@@ -20,28 +20,28 @@ SCENE = "[material]\ndensity = 1000\n\n[time]\nstep = 0.01\n"
 
 
 def cells() -> np.ndarray:
-    """(2, 8)."""
+    """Return the nodes (2, 8) of the cells."""
     return np.array([[number(H * (corner + x * X)) for corner in CORNERS] for x in (0, 1)])
 
 
 def number(place: np.ndarray) -> int:
-    """Return the number of the node there."""
+    """Return the number of the node at a place."""
     return int(np.argmin(np.linalg.norm(NODES - place, axis=1)))
 
 
 def springs() -> np.ndarray:
-    """(s, 2) along the edges."""
+    """Return the springs (s, 2) along the edges."""
     i, j = np.nonzero(np.isclose(np.linalg.norm(NODES[:, None] - NODES, axis=2), H))
     return np.column_stack([i, j])[i < j]
 
 
 def position(index: int) -> np.ndarray:
-    """(12, 3): the bar is sheared, by 0.1 more at each frame [m]."""
+    """Return the positions (12, 3) [m] of the bar, sheared by 0.1 more at each frame."""
     return NODES + 0.1 * index * NODES[:, [2]] * [1, 0, 0]
 
 
 def frame(index: int, **other) -> Frame:
-    """Frame `index`, with `other` values in place of its own."""
+    """Return frame ``index``, with ``other`` values in place of its own."""
     energies = dict(kinetic=1.0 * index, elastic=2.0 * index, potential=-1.0, contact=0.0)
     numbers = dict(step_error=1e-6, iterations=3, ksp_its=9, wall_time=0.1 * index)
     arrays = dict(
@@ -59,7 +59,7 @@ def write(
     points: np.ndarray = POINTS,
     **lattice,
 ) -> Path:
-    """The file, with other frames or other arrays of the lattice where they are given."""
+    """Write the file, with other frames or other arrays of the lattice if they are given."""
     frames = [frame(index) for index in range(FRAMES)] if frames is None else frames
     s = len(springs())
     arrays = dict(nodes=NODES, cells=cells(), springs=springs(), mass=np.full(len(NODES), 0.25))

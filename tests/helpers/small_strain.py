@@ -38,7 +38,7 @@ ACROSS = (2, 4, 6, 8)
 LENGTH, RADIUS = 0.5, 0.05
 # offsets of the grid across the bar [cells]
 OFFSETS = ((0.0, 0.0), (0.3, 0.7), (0.5, 0.5))
-# stands for springs in place of the Poisson's ratio of a neo-Hookean solid
+# a value of Poisson's ratio that stands for springs instead of a neo-Hookean solid
 SPRINGS = None
 LAWS = {"springs": SPRINGS, "neo-Hookean": NU}
 # treatment of boundary cells, and law
@@ -82,7 +82,7 @@ def box(cells: Iterable[int], cell_size: float, poisson: float | None = SPRINGS)
 def hessian(lattice: Lattice, q: np.ndarray | None = None) -> csc_array:
     """Return the Hessian of E (3n, 3n) [N/m] at positions q (n, 3), or at rest, from 81 products.
 
-    Nodes three cells apart share no cell, so a product serves all nodes of a colour.
+    Nodes three cells apart share no cell, so one product serves all nodes of a colour.
     """
     n = len(lattice.nodes)
     ijk = np.rint((lattice.nodes - lattice.nodes.min(axis=0)) / lattice.cell_size).astype(int)
@@ -131,7 +131,7 @@ def factorise(K: csc_array) -> Callable[[np.ndarray], np.ndarray]:
 
 
 class Section(NamedTuple):
-    """E I [N m^2], kappa G A [N], rho A [kg/m] and rho I [kg m] of a beam."""
+    """Section: E I [N m^2], kappa G A [N], rho A [kg/m] and rho I [kg m] of a beam."""
 
     EI: float
     kGA: float
@@ -148,9 +148,9 @@ def beam_section(across: float = np.inf) -> Section:
     """Return the section of the square beam, or of its lattice with ``across`` cells across.
 
     A cell's edges stay straight. The displacements u_x = c x z and u_y = -nu c y z of its corners
-    stretch edges and face diagonals (k1 : k2 = 40 : 16). Their energy per volume sums to
-    103/560 E c^2 h^2 / 2, bending has 1/12 E c^2 h^2 / 2. So E I grows by 1 + 169/140 (h/b)^2.
-    Masses at the corners increase rho I by 1 + 2 (h/b)^2.
+    stretch edges and face diagonals (k1 : k2 = 40 : 16). Their energy per volume sums to 103/560 E
+    c^2 h^2 / 2, while bending has 1/12 E c^2 h^2 / 2. So E I grows by 1 + 169/140 (h/b)^2. Masses
+    at the corners increase rho I by 1 + 2 (h/b)^2.
     """
     solid = section(WIDTH**2, WIDTH**4 / 12, KAPPA_SQUARE)
     ratio = 1 / across**2
@@ -169,15 +169,15 @@ def tip_sag(beam: Section, length: float) -> float:
 
 
 def timoshenko_sag(across: float = np.inf) -> float:
-    """Return the tip deflection [m] of the beam as cantilever under its weight."""
+    """Return the tip deflection [m] of the beam as a cantilever under its weight."""
     return tip_sag(beam_section(across), BEAM * WIDTH)
 
 
 def timoshenko_frequency(across: float = np.inf) -> float:
-    """Return the first bending frequency [Hz] of the beam as cantilever.
+    """Return the first bending frequency [Hz] of the beam as a cantilever.
 
-    Along x, (w, phi, M, V)' = B (w, phi, M, V). At the clamp w = phi = 0, at the free end
-    M = V = 0. So the block of exp(B L) that maps M, V from the clamp to the free end is singular.
+    Along x, (w, phi, M, V)' = B (w, phi, M, V). At the clamp w = phi = 0, at the free end M = V =
+    0. So the block of exp(B L) that maps M, V from the clamp to the free end is singular.
     """
     beam = beam_section(across)
     length = BEAM * WIDTH
@@ -230,7 +230,7 @@ class Clamped:
 
 
 def lattice_beam(across: int, poisson: float | None = SPRINGS) -> tuple[float, float]:
-    """Return tip deflection [m] and first bending frequency [Hz] of a beam's lattice."""
+    """Return the tip deflection [m] and the first bending frequency [Hz] of a beam's lattice."""
     clamped = Clamped(box((BEAM * across, across, across), WIDTH / across, poisson))
     return clamped.sag(BEAM * WIDTH), clamped.frequency()
 

@@ -25,18 +25,18 @@ Tables = dict[str, Any]
 
 
 class Run(NamedTuple):
-    """A run's lattice and its frames."""
+    """The lattice and the frames of a run."""
 
     lattice: Lattice
     frames: list[Frame]
 
     @property
     def iterations(self) -> int:
-        """Sum of the iterations of all frames."""
+        """Number of iterations, the sum over all frames."""
         return sum(frame.iterations for frame in self.frames)
 
     def moved(self, x: float, axis: int = 0) -> np.ndarray:
-        """Return the mean displacement (3,) [m], weighted by mass, of nodes with a coordinate."""
+        """Return the mean displacement (3,) [m], weighted by mass, of the nodes at a coordinate."""
         rest = self.lattice.nodes
         at = np.isclose(rest[:, axis], x)
         return np.average(
@@ -111,8 +111,8 @@ def elastica(across: int, poisson: float | None) -> Run:
     return bent(LENGTH, across, poisson, 5 * E / 12 / LENGTH**2)
 
 
-# Energy [J] of a square bar of six sides by the angle [degrees] between its ends, at a
-# Poisson's ratio of 0.25: quadratic hexahedra of the same law, 2 and 4 across,
+# Energy [J] of a square bar six sides long, by the angle [degrees] between its ends, at
+# Poisson's ratio 0.25. From quadratic hexahedra of the same law, 2 and 4 across,
 # extrapolated with order 4, which changes it by 0.1%
 TURNED = {30: 1292.4, 90: 11632.0, 180: 46522.0}
 
@@ -165,7 +165,7 @@ TILT = Rotation.from_rotvec([0, 0, 0.35]) * Rotation.from_rotvec([0, 0.35, 0])
 
 
 def compliance(cells: int, tilt: Rotation, held: float, poisson: float | None = SPRINGS) -> float:
-    """Return the work [J] of a bar's weight, with cells per radius and held radii clamped."""
+    """Return the work [J] of a bar's weight, by cells per radius and clamped length in radii."""
     length = FREE + held * RADIUS
     mesh = trimesh.creation.cylinder(RADIUS, length, sections=256)
     mesh.vertices = tilt.apply(mesh.vertices[:, [2, 0, 1]] + [length / 2 - held * RADIUS, 0, 0])
@@ -177,7 +177,7 @@ def compliance(cells: int, tilt: Rotation, held: float, poisson: float | None = 
 
 
 def limit(coarse: int, fine: int, poisson: float | None = SPRINGS) -> float:
-    """Return the work [J] of a bar along the grid, extrapolated to cell size 0 (Richardson)."""
+    """Return the work [J] for a bar along the grid, extrapolated to cell size 0 (Richardson)."""
     a, b = (compliance(cells, Rotation.identity(), 0.0, poisson) for cells in (coarse, fine))
     return b + (b - a) / ((fine / coarse) ** 2 - 1)
 
@@ -185,7 +185,7 @@ def limit(coarse: int, fine: int, poisson: float | None = SPRINGS) -> float:
 def clamp_errors(
     sizes: tuple[int, ...], exact: float, held: float, poisson: float | None = SPRINGS
 ) -> np.ndarray:
-    """Return the relative error of the stiffness for each size in cells per radius."""
+    """Return the relative error of the stiffness for each number of cells per radius."""
     return exact / np.array([compliance(cells, TILT, held, poisson) for cells in sizes]) - 1
 
 

@@ -1,5 +1,4 @@
-"""Runs to be stopped: a hanging block, signals at a step, the ranks of an mpiexec; whether two
-results are the same."""
+"""Runs to be stopped: a hanging block, signals at a step, ranks of an mpiexec, comparisons."""
 
 import copy
 import os
@@ -26,8 +25,7 @@ EVERY, STEPS = 3, 40
 
 @pytest.fixture(scope="module", autouse=True)
 def every_step_forgets() -> Iterator[None]:
-    """Have, where it is imported, a checkpoint after each step, so that a run goes on from wherever
-    it was stopped."""
+    """Write a checkpoint after each step, so that a run can continue from any step."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulate, "REMEMBERED", 1)
         yield
@@ -50,7 +48,7 @@ def hanging(folder: Path, steps: int = STEPS, **tables) -> Path:
 
 
 def assert_same(path: Path, whole: Path, rtol: float = 0.0) -> None:
-    """All frames of two files, bit by bit unless they may differ, but for how long they took."""
+    """Assert that all frames agree to ``rtol``, bit by bit for 0, except wall times."""
     with h5py.File(path) as one, h5py.File(whole) as other:
         assert one["frames"].keys() == other["frames"].keys() and finished(one) == finished(other)
         stored = (FRAME_FIELDS.keys() & one["frames"]) - {"wall_time"}
@@ -69,7 +67,7 @@ def assert_same(path: Path, whole: Path, rtol: float = 0.0) -> None:
 def at_step(
     monkeypatch: pytest.MonkeyPatch, step: int, action: Callable[[], object], is_stored: bool = True
 ) -> None:
-    """Have ``action`` happen when the run has taken that step, its frame stored or not yet."""
+    """Call ``action`` when the run has taken that step, before or after its frame is stored."""
     advance = TimeLoop.advance
 
     def watched(simulation):
@@ -84,12 +82,12 @@ def at_step(
 
 
 def signal_after(monkeypatch: pytest.MonkeyPatch, step: int, number: signal.Signals) -> None:
-    """This process gets the signal when the run has taken that step."""
+    """Send the signal to this process when the run has taken that step."""
     at_step(monkeypatch, step, lambda: os.kill(os.getpid(), number), is_stored=False)
 
 
 def assert_equal(found: dict, expected: dict) -> None:
-    """Frames or checkpoints, bit by bit, but for how long they took."""
+    """Assert that frames or checkpoints agree bit by bit, except wall times."""
     assert found.keys() == expected.keys()
     for name in expected.keys() - {"wall_time", "Monitors.work.wall_time"}:
         assert expected[name] is None or np.array_equal(
@@ -98,9 +96,13 @@ def assert_equal(found: dict, expected: dict) -> None:
 
 
 def assert_goes_on_exactly(path: Path, every: int) -> list[Frame | None]:
-    """Take two steps from some checkpoints of a run, which are every so many steps: frames and
-    checkpoints are the same to the last bit. Returns the frames of the whole run, None where a step
-    has none."""
+    """Check that two steps from some checkpoints of a run give the same frames and checkpoints.
+
+    Agreement is to the last bit. Returns the frames of the whole run, None for a step without a
+    frame.
+
+    every : number of steps between checkpoints
+    """
     scene, comm = load_scene(path), MPI.COMM_SELF
     model, frames, saved = build_model(comm, scene), [], []
     with pytest.MonkeyPatch.context() as patch:
@@ -134,7 +136,7 @@ def assert_goes_on_exactly(path: Path, every: int) -> list[Frame | None]:
 
 
 def ranks_of(mpiexec: subprocess.Popen) -> list[int]:
-    """Process numbers of its ranks."""
+    """Return the process numbers of its ranks."""
     children = Path(f"/proc/{mpiexec.pid}/task/{mpiexec.pid}/children").read_text().split()
     return sorted(
         int(child) for child in children if b"python" in Path(f"/proc/{child}/cmdline").read_bytes()

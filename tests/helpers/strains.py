@@ -12,8 +12,7 @@ C11, C12, C44 = 6 / 5 * E, 2 / 5 * E, 2 / 5 * E
 
 
 def elastic_constant(lattice: Lattice, G: np.ndarray, other: np.ndarray) -> float:
-    """u^T H v / volume [Pa] of the linear displacements u = G x, v = other x, their gradients (3,
-    3)."""
+    """Return u^T H v / volume [Pa] for u = G x and v = other x; G and other are (3, 3)."""
     u, v = ((lattice.nodes @ gradient.T).ravel() for gradient in (G, other))
     return u @ (hessian(lattice) @ v) * DENSITY / lattice.mass.sum()
 

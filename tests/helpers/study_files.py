@@ -1,4 +1,4 @@
-"""Study files, their tables and pages, for tests of studies. The runs are stand-ins."""
+"""Study files, their tables and pages, for tests of studies; runs are stand-ins."""
 
 import csv
 import re
@@ -30,7 +30,7 @@ ONE_SCENE = '[[scene]]\nname = "a"\nfile = "scene.toml"\n'
 
 @pytest.fixture
 def stand_in(monkeypatch):
-    """Cases run the stand-in, not the program."""
+    """Make cases run the stand-in instead of the program."""
 
     def stands_in(case: Case, result: Path, figures: Path) -> list[str]:
         words = command(case, result, figures)
@@ -44,7 +44,7 @@ def stand_in(monkeypatch):
 
 @pytest.fixture
 def own_log():
-    """The command line sets up the log for its own process: afterwards it is as it was."""
+    """Restore the log after the test, because the command line sets it up."""
     before = log.handlers, log.level
     yield
     log.handlers, log.level = before
@@ -58,7 +58,7 @@ def study_file(folder: Path, text: str) -> Path:
 
 
 def carry_out(folder: Path, text: str, **options) -> list[dict]:
-    """The rows of a study in this folder."""
+    """Return the rows of a study in this folder."""
     run_study(study_file(folder, text), folder / "out", **options)
     return records(read_table(folder / "out"))
 
@@ -85,8 +85,7 @@ VOID = {"meta", "br"}
 
 
 def row_of(label: str, **given) -> dict[str, str]:
-    """A row of the table as text; frames a second and seconds a simulated second follow from the
-    time a frame."""
+    """Return a row of the table as text; some columns follow from the time of a frame."""
     row = {
         "label": label,
         "preset": label,
@@ -113,7 +112,7 @@ def write_rows(folder: Path, rows: list[dict[str, str]]) -> Path:
 
 
 def spaced(text: str) -> str:
-    """With plain spaces between numbers and units."""
+    """Return the text with plain spaces between numbers and units."""
     return text.replace("\N{NO-BREAK SPACE}", " ")
 
 
@@ -128,7 +127,7 @@ def tooltips(text: str) -> list[str]:
 
 
 class Balance(HTMLParser):
-    """Fails where an element ends that is not open."""
+    """Parser of HTML that fails if an element ends that is not open."""
 
     def __init__(self, text: str):
         super().__init__()

@@ -1,9 +1,9 @@
-"""Stand in for ``msmpetsc run`` in tests of studies: 8 nodes that swing by a formula.
+"""Stand-in for ``msmpetsc run`` in tests of studies: 8 nodes that swing by a formula.
 
     study_stand_in.py run SCENE -o OUT.h5 --overwrite --measure M.json --set ... [PETSc options]
 
-Its options rule the outcome. -ksp_fail ends it with an error, -ksp_hang never ends it, and
--ksp_children starts a further process before. -ksp_exit N ends it with that status, -ksp_kind K
+Its options decide the outcome. -ksp_fail ends it with an error, -ksp_hang never ends it, and
+-ksp_children starts another process first. -ksp_exit N ends it with that status, -ksp_kind K
 reports a failed step of that kind. Its wall time counts the runs of the folder, and the error of
 its motion is the time step.
 """
@@ -21,7 +21,7 @@ CALLS = "calls.txt"
 
 
 def begin(words: list[str]) -> None:
-    """Record the call, and start and do the work to be stopped: before slow imports."""
+    """Record the call and start the requested work, before slow imports."""
     folder = Path(words[words.index("-o") + 1]).parent.parent
     if os.environ.get("OMPI_COMM_WORLD_RANK", "0") == "0":
         with open(folder / CALLS, "a") as file:
@@ -75,7 +75,7 @@ def main() -> None:
 
 
 def write(comm, out: Path, table: dict, every: int, count: int) -> None:
-    """Frames off the exact motion by the time step."""
+    """Write frames whose error from the exact motion is the time step."""
     step, own = table["step"], slice(None) if comm.rank == 0 else slice(0)
     count_of_frames = round(table["duration"] / step / every) + 1
     with ResultFile(out, comm, {"scene": "", "ranks": comm.size}, Begin.OVERWRITE) as file:

@@ -1,4 +1,4 @@
-"""A surface to draw whose nodes are its points, for tests of drawing alone."""
+"""A surface to draw whose nodes are its points, for tests of drawing without a result."""
 
 import tomllib
 
@@ -11,7 +11,7 @@ from msmpetsc.view.drawable import BodiesAtRest, Drawable
 
 
 def drawable_of(points: np.ndarray, triangles: np.ndarray) -> Drawable:
-    """Return the surface at rest, of a cell so large that no triangle is divided."""
+    """Return the drawable surface at rest; its cell is so large that no triangle is divided."""
     ends = [*points.argmin(axis=0), *points.argmax(axis=0)]
     body = np.zeros(len(points), int)
     return Drawable(

@@ -1,4 +1,4 @@
-"""Surfaces and bodies of trimesh's meshes."""
+"""Surfaces and bodies from trimesh's meshes."""
 
 import numpy as np
 import trimesh

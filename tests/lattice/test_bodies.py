@@ -1,4 +1,4 @@
-"""Several bodies in a run: each moves as if it were alone, however they lie."""
+"""Several bodies in a run each move as if they were alone, in any arrangement."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -26,8 +26,8 @@ H = 0.125
 SPRINGS = {"young_modulus": 1e5, "density": 1000.0, "law": "linear"}
 UPPER = {"box": [[0, 0, 0.8], [1, 1, 1]], "relative": True}
 GROUND = plane_at(-0.06, response="penalty", stiffness=2e3)
-# a ball that falls spinning on the ground, a bar in the same place that hangs and is
-# pulled, a block half of lead
+# a ball that falls spinning on the ground; a bar in the same place that hangs and is
+# pulled; a block, half of lead
 BODIES: list[dict[str, Any]] = [
     {"mesh": {"source": "ball.ply"},
     "start": {"velocity": [0.5, 0, -1], "spin": [0, 3, 0], "scale": [1, 1, 0.9]}},
@@ -59,7 +59,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def write(folder: Path, name: str, **tables: Any) -> Path:
-    """A scene file; ``tables`` are added to it, or take a table's place."""
+    """Write a scene file; ``tables`` replace or extend its tables."""
     scene = {
         "cages": {"cell_size": H},
         "material": SPRINGS,
@@ -82,9 +82,10 @@ def alone(folder: Path, number: int, **tables: Any) -> Path:
 
 @pytest.mark.parametrize("integrator", ["implicit-euler", "verlet"])
 def test_bodies_move_as_each_does_alone(folder: Path, integrator: str):
-    """They overlap from the start and do not touch.
+    """Bodies overlap from the start without contact, and each moves as it does alone.
 
-    Obstacles, parts, pins, anchors, forces and starts are there. Each region is of a single body.
+    Obstacles, parts, pins, anchors, forces and starts take part. Each region belongs to a single
+    body.
     """
     time = {"step": 0.01, "duration": 0.1, "integrator": integrator}
     time |= {"substep": 5e-4} if integrator == "verlet" else {}
@@ -112,7 +113,7 @@ def test_bodies_move_as_each_does_alone(folder: Path, integrator: str):
 
 @pytest.fixture(scope="module")
 def on_three(folder: Path) -> Path:
-    """The result of all bodies on three ranks, whose standard error lies beside it."""
+    """Return the result of all bodies on three ranks; its standard error lies beside it."""
     tables = {"time": {"step": 0.0025, "duration": 0.25}, "output": {"every": 4}}
     path = write(
         folder,
@@ -171,7 +172,7 @@ def test_a_run_of_bodies_goes_on(folder: Path, on_three: Path, msmpetsc: Run):
 
 
 def grids(*cells: tuple[int, int, int]) -> BodyGrids:
-    """Bodies of so many cells along each axis, all at the origin."""
+    """Return grids of so many cells along each axis, all at the origin."""
     return BodyGrids.covering([np.array([[0, 0, 0], sides], float) for sides in cells], 1.0)
 
 
@@ -193,7 +194,7 @@ def test_no_two_bodies_have_a_node_in_common_and_one_follows_the_other():
 
 
 def test_coarse_cells_join_no_bodies_until_they_are_as_large():
-    """A node of a grid coarsened l times, with weights from i to i + 1, is of a single body."""
+    """The weights of a node on a grid coarsened ``level`` times reach only one body."""
     several = grids((7, 7, 7), (7, 7, 7), (7, 7, 7))
     # a body is a single cell at level 3
     for level in range(4):
@@ -220,13 +221,13 @@ def test_count_is_that_of_all_bodies(folder: Path):
         model_of(write(folder, "most", body=BODIES), "cages.max_cells=100")
 
 
-# Whose tables
+# Tables of the scene and of bodies
 
 
 def test_tables_of_the_scene_are_of_all_bodies(folder: Path):
     """The scene's pin holds nodes of any body in its region.
 
-    Its start is the start of a body without its own.
+    The scene's start is the start of a body without its own.
     """
     bodies = [{"mesh": {"source": "bar.ply", "base": [x, 0, 0]}} for x in (0, 1)]
     bodies[1]["start"] = {"velocity": [0, 1.0, 0]}
@@ -266,8 +267,7 @@ def test_in_statics_each_body_must_be_held(folder: Path):
 
 
 def test_the_shape_of_each_body_counts_alone(folder: Path, msmpetsc: Run):
-    """Bodies that fly apart are as they were, each of them; the farthest from its shape is the
-    error."""
+    """Bodies that fly apart keep their shapes; the body farthest from its shape gives the error."""
     bodies = [
         {"mesh": {"source": "block.ply"}, "start": {"velocity": [v, 0, 0]}} for v in (-1.0, 1.0)
     ]

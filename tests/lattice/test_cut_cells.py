@@ -1,5 +1,4 @@
-"""Mass and stiffness of cells that the surface cuts, and bodies that do not lie along the grid
-against elasticity."""
+"""Mass and stiffness of cells that the surface cuts, and oblique bodies against elasticity."""
 
 from functools import cache
 
@@ -43,7 +42,7 @@ def test_springs_have_the_mean_fill_of_the_corners_that_agree_with_both_ends():
 def test_uniform_strain_costs_the_energy_of_the_volume_inside():
     """For a box askew in the grid, u^T H u = C volume of any uniform strain.
 
-    Only the least fill of corners differs.
+    Only the least fill of corners causes a difference.
     """
     box = tilted_box()
     lattice = study.lattice_of(box, 0.06, "fill")
@@ -55,8 +54,10 @@ def test_uniform_strain_costs_the_energy_of_the_volume_inside():
 
 
 def test_every_node_has_the_mass_that_its_springs_diagonal_says():
-    """So no light corner is stiff: the limit of explicit steps is a whole cell's, and CG brings in
-    no net force."""
+    """Masses are proportional to stiffnesses, so explicit steps have the limit of a whole cell.
+
+    CG then also adds no net force.
+    """
     lattice = study.lattice_of(tilted_box(), 0.06, "fill")
     assert lattice.mass.min() < 0.01 * lattice.mass.max()
     diagonal = np.bincount(lattice.springs.ravel(), np.repeat(lattice.stiffness, 2))
@@ -83,7 +84,7 @@ def test_bars_across_the_grid_sag_as_timoshenkos(name: str):
     assert whole[1].mean() < 3 * errors[0].mean() and whole[2].mean() > 0.3
 
 
-# ---- how far nodes stick out
+# ---- how far nodes protrude
 
 
 def test_nodes_stick_out_of_a_ball_by_their_distance_and_meet_a_plane_when_it_does():

@@ -1,5 +1,4 @@
-"""Regions by the names that a mesh gives: of every format, after every step of prepare, on any
-ranks."""
+"""Regions by the names in a mesh: in every format, after every step of prepare, on any ranks."""
 
 from itertools import product
 from pathlib import Path
@@ -47,7 +46,7 @@ def write_ply(path: Path, mesh: trimesh.Trimesh, names: dict[str, np.ndarray]) -
 
 
 def write_glb(path: Path, mesh: trimesh.Trimesh, names: dict[str, np.ndarray]) -> None:
-    """The ends hang at the side: they are parts of that node, moved by it."""
+    """Write a glTF file in which the ends are children of the side's node, and move with it."""
     scene = trimesh.Scene()
     moved = trimesh.transformations.translation_matrix([1, 2, 3])
     parts = {name: mesh.submesh([np.flatnonzero(own)], append=True) for name, own in names.items()}
@@ -82,7 +81,7 @@ def grouped(
 
 @pytest.mark.parametrize(("end", "name"), [(end, name) for end in WRITERS for name in NAMES[end]])
 def test_a_group_is_where_its_triangles_are(end: str, name: str | int, tmp_path: Path):
-    """A face in a plane of the grid has the nodes in it, as a box about it has."""
+    """A face in a plane of the grid selects the nodes in it, as a box around it does."""
     of_box = model_of(block_scene(tmp_path, name="box", time=ONCE, pin=[{"region": LEFT}])).lattice
     lattice = model_of(grouped(tmp_path, end=end, pin=[{"region": {"group": name}}])).lattice
     assert np.array_equal(lattice.pinned, of_box.pinned) and np.array_equal(
@@ -91,8 +90,7 @@ def test_a_group_is_where_its_triangles_are(end: str, name: str | int, tmp_path:
 
 
 def test_nodes_of_a_group_are_those_nearest_to_its_points(tmp_path: Path):
-    """Askew in the grid: each point of the triangles, and no other, has the node that is nearest to
-    it."""
+    """Askew in the grid, each point of the triangles selects only the node nearest to it."""
     turn = {
         "prepare": [{"rotate": {"axis": [1.0, 2.0, 3.0], "degrees": 50.0}}],
         "base": [0.3, 0.1, 0.2],
@@ -141,7 +139,7 @@ def test_a_group_stays_where_it_is_whatever_prepares_the_mesh(step, tmp_path: Pa
 def test_a_large_mesh_turns_with_its_groups(tmp_path: Path, monkeypatch):
     monkeypatch.setattr("msmpetsc.geometry.prepare.LEAST_CACHED", 1)
     turn = {"prepare": [{"rotate": {"axis": [0.0, 0.0, 1.0], "degrees": 90.0}}]}
-    # the second pass reads the mesh that the first pass cached
+    # the second pass reads the mesh that the first pass has cached
     for _ in range(2):
         group = model_of(grouped(tmp_path, mesh=turn)).bodies[0].surface.groups["right"]
         assert np.allclose(group.points[:, 1], SIDES[0])
@@ -177,7 +175,7 @@ def test_a_part_of_an_open_group_is_the_cells_that_it_cuts(tmp_path: Path):
 
 
 def test_groups_of_several_bodies(tmp_path: Path):
-    """A scene's own table means the group of every body that has it, a body's its own."""
+    """A scene's table means the group of every body that has it, a body's table its own group."""
     write_obj(tmp_path / "block.obj", *block())
     far, plain = {"source": "block.obj", "base": [3.0, 0, 0]}, tmp_path / "plain.stl"
     block()[0].export(plain)

@@ -1,4 +1,4 @@
-"""How a body starts: its places, its velocities, the same on any number of ranks."""
+"""How a body starts: positions and velocities, the same on any number of ranks."""
 
 from functools import partial
 from pathlib import Path
@@ -22,12 +22,12 @@ NEAR = [{"region": {"box": [[-1, -1, -1], [0.01, 1, 1]]}}]
 
 
 def begin(folder: Path, start: dict, **tables) -> tuple[Model, list[Frame]]:
-    """Return the model with its start and the frames of a step."""
+    """Return the model with its start, and the frames of one step."""
     return play(block_scene(folder, time={"step": T, "duration": T}, start=start, **tables))
 
 
 def at_start(folder: Path, start: dict) -> tuple[Model, Frame]:
-    """Return the start alone: a step of a body that is a line is decided by rounding."""
+    """Return only the start, because rounding decides the step of a body that is a line."""
     path = block_scene(folder, time={"step": T, "duration": T}, start=start)
     with loop_of(path) as simulation:
         return simulation.model, next(simulation.frames())
@@ -69,8 +69,7 @@ def test_twist_about_a_slanted_axis_turns_all_in_planes_across_it(tmp_path: Path
 
 
 def test_scale_comes_before_twist_and_scatter_after_it(tmp_path: Path):
-    """Collapsed to its axis, a twist changes nothing; and where all goes to its random place,
-    nothing else is left."""
+    """A twist changes nothing after a collapse to its axis, and full scatter removes all else."""
     line = begin(tmp_path, {"scale": [1, 0, 0], "twist": {"axis": [1, 0, 0], "degrees": 90}})[1][
         0
     ].position
@@ -89,8 +88,10 @@ def test_scale_comes_before_twist_and_scatter_after_it(tmp_path: Path):
 
 
 def test_scatter_is_anywhere_in_the_box(tmp_path: Path):
-    """Mean and variance of an even spread, a 1/2 and 1/12 of a side, within four standard
-    deviations of each."""
+    """Mean and variance are those of a uniform distribution: 1/2 and 1/12 of a side.
+
+    Both are within four standard deviations.
+    """
     q = begin(tmp_path, {"scatter": 1.0})[1][0].position / SIDES
     n = len(q)
     assert (q >= 0).all() and (q < 1).all() and len(np.unique(q)) == q.size
@@ -110,7 +111,7 @@ def test_velocity_is_momentum_from_the_first_frame_on_and_free_flight_after(tmp_
 
 @pytest.mark.parametrize("integrator", ["implicit-euler", "verlet"])
 def test_spin_has_the_angular_momentum_of_the_block(tmp_path: Path, integrator: str):
-    """I_zz = m (a^2 + b^2) / 12 and, since a cell's mass sits at its corners, 2 m h^2 / 6 more."""
+    """I_zz = m (a^2 + b^2) / 12, plus 2 m h^2 / 6 because a cell's mass is at its corners."""
     spin = np.array([2.0, -1.0, 3.0])
     path = block_scene(
         tmp_path,
@@ -131,7 +132,7 @@ def test_spin_has_the_angular_momentum_of_the_block(tmp_path: Path, integrator: 
 def test_gradient_stretches_and_turns_about_the_centre_or_a_point(tmp_path: Path):
     """The kinetic energy of diag(a, b, c) is m/2 (a^2 (A^2 / 12 + h^2 / 6) + ...).
 
-    A cell's mass sits at its corners. An antisymmetric gradient is a spin.
+    A cell's mass is at its corners. An antisymmetric gradient is a spin.
     """
     rates, about = np.array([2.0, -1.0, 3.0]), np.array([0.1, 0.2, -0.3])
     second = SIDES**2 / 12 + CELL**2 / 6
@@ -156,7 +157,7 @@ def test_gradient_stretches_and_turns_about_the_centre_or_a_point(tmp_path: Path
 def test_swirl_of_the_twisting_column(tmp_path: Path, h: float):
     """A column of 1 x 6 x 1 m and 1100 kg/m^3 that turns by 105 sin(pi y / 12) has 3.031875 MJ.
 
-    With lumped masses, sums of x^2 are larger by h^2 / 6. Sums of the sine follow the trapezium
+    With lumped masses, sums of x^2 are larger by h^2 / 6. Sums of the sine follow the trapezoidal
     rule. It is exact for sine^2 and gives h/2 cot(pi h / 24) for the sine.
     """
     y = np.arange(0, 6 + h / 2, h)
@@ -189,7 +190,7 @@ def test_a_swirl_is_constant_beyond_its_table(tmp_path: Path):
 
 
 def hung(folder: Path, name: str, **tables) -> Path:
-    """A block that hangs by its side."""
+    """Return the scene of a block that hangs by its side."""
     material = solid_of(2e4)
     gravity = GRAVITY
     tables = {"pin": NEAR, "material": material, "gravity": gravity} | tables
@@ -197,7 +198,7 @@ def hung(folder: Path, name: str, **tables) -> Path:
 
 
 def test_a_state_of_equilibrium_stays_at_rest_on_any_number_of_ranks(tmp_path: Path):
-    """To the errors of its solves, 1e-9; the pinned nodes keep their places in the file."""
+    """It stays to the errors of its solves, 1e-9; pinned nodes keep their positions in the file."""
     at_rest = result_on(1, hung(tmp_path, "rest", time={"integrator": "static"}))
     nodes, found = at_rest["lattice/nodes"][:], at_rest["frames/position"][-1]
     sag = np.abs(found - nodes).max()
@@ -231,8 +232,7 @@ def test_held_components_keep_their_places_in_the_file(tmp_path: Path):
 
 
 def test_a_run_from_a_moving_state_is_the_rest_of_a_longer_run(tmp_path: Path):
-    """Implicit Euler knows no more than positions and velocities; a velocity of the table is
-    added."""
+    """Implicit Euler needs only positions and velocities; a velocity of the table is added."""
     time = {"step": T, "duration": 12 * T}
     whole = result_on(1, hung(tmp_path, "whole", time=time))["frames/position"][:]
     result_on(1, hung(tmp_path, "half", time=time), "--frames", 5)
@@ -251,7 +251,7 @@ def test_a_run_from_a_moving_state_is_the_rest_of_a_longer_run(tmp_path: Path):
 
 
 def test_a_state_that_does_not_fit_is_refused_on_all_ranks(tmp_path: Path):
-    """Another lattice, no file, no result, a state that is also scaled."""
+    """Another lattice, a missing file, a file that is no result, and a scale are refused."""
     result_on(1, hung(tmp_path, "rest", time={"integrator": "static"}))
     path = hung(tmp_path, "go", start={"from": "rest_1.h5"}, time={"step": T, "duration": T})
     for words, ranks, change in (

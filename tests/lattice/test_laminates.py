@@ -23,21 +23,24 @@ def lattice_of(folder: Path, **tables) -> Lattice:
 
 
 def test_coats_of_a_fifth_of_a_cell_bend_a_bar():
-    """With cells of a single material by their middles the bar would be 81% too soft; with means
-    and no moments of stiffness, 38% too soft."""
+    """Coats of a fifth of a cell give a bar its bending stiffness.
+
+    With a single material per cell, by its middle, the bar would be 81% too soft. With means but
+    without moments of stiffness it would be 38% too soft.
+    """
     assert abs(error(SKIN, 0, 2)) < 0.06
     # a uniform bar is 12% too stiff at 20 degrees with two cells across
     assert abs(error(SKIN, 20, 2)) < 0.12
 
 
 def test_layers_that_lie_askew_in_the_grid_are_pulled():
-    """By their middles, cells of a single material would be 20 and 8% too soft."""
+    """With a single material per cell, by its middle, the bars would be 20 and 8% too soft."""
     for across, within in ((2, 0.06), (4, 0.03)):
         assert abs(error(PLY, 20, across)) < within
 
 
 def test_springs_of_cut_cells_bend_and_are_pulled():
-    """A uniform bar of springs is 31% too stiff with two cells across, 8% with four."""
+    """A uniform bar of springs is 31 and 8% too stiff with two and four cells across."""
     assert abs(error(PLY, 20, 4, SPRINGS)) < 0.06
     assert abs(error(SKIN, 0, 4, SPRINGS)) < 0.1
 
@@ -45,7 +48,7 @@ def test_springs_of_cut_cells_bend_and_are_pulled():
 @pytest.mark.parametrize("place", [0.1, 0.25, 0.31])
 @pytest.mark.parametrize("law", ["neo-hookean", "linear"])
 def test_mass_is_that_of_the_volumes(tmp_path: Path, place: float, law: str):
-    """The interface lies along the grid, anywhere in a cell: a share errs by 1/128."""
+    """An interface along the grid, anywhere in a cell: the shares err by at most 1/128."""
     region = {"half_space": {"point": [place, 0, 0], "normal": [1, 0, 0]}}
     part = {"region": region, "density": 3 * DENSITY, "young_modulus": 7 * YOUNG}
     material = {"young_modulus": YOUNG, "density": DENSITY, "law": law}
@@ -57,7 +60,7 @@ def test_mass_is_that_of_the_volumes(tmp_path: Path, place: float, law: str):
 
 
 def test_closed_groups_askew_have_their_volumes(tmp_path: Path):
-    """Two blocks fill a body that the grid cuts. A sample outside the body counts for neither."""
+    """Two blocks fill a body that the grid cuts; samples outside the body count for neither."""
     bounds = {"near": [[0, 0, 0], SIDES * [0.4, 1, 1]], "far": [SIDES * [0.4, 0, 0], SIDES]}
     boxes = {name: trimesh.creation.box(bounds=corners) for name, corners in bounds.items()}
     write_parts(tmp_path / "two.obj", boxes)
@@ -70,7 +73,7 @@ def test_closed_groups_askew_have_their_volumes(tmp_path: Path):
     lattice = lattice_of(tmp_path, mesh=mesh, part=parts)
     exact = (0.4 * 2 + 0.6 * 5) * DENSITY * SIDES.prod()
     assert lattice.mass.sum() == pytest.approx(exact, rel=3e-3)
-    # next to nothing is of the scene's own material
+    # a negligible volume is of the scene's own material
     stiffness = lattice.cell_stiffness[: lattice.cells_owned].sum()
     exact = edge_stiffness(3 * YOUNG, CELL) * lattice.cell_fill.sum()
     assert stiffness == pytest.approx(exact, rel=1e-3)

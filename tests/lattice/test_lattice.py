@@ -1,4 +1,4 @@
-"""The lattice: against its definition by brute force, and the material against elasticity."""
+"""The lattice agrees with its definition by brute force."""
 
 import numpy as np
 import pytest
@@ -57,7 +57,7 @@ def test_springs_and_masses_follow_the_definition(cells: set):
 def test_the_inertia_of_a_turning_bar_is_too_large_by_two_over_n_squared(
     across: int, excess: float
 ):
-    """The trapezoidal rule for the integral of x^2 over n cells of size h: a^3 / 12 + a h^2 / 6."""
+    """The trapezoidal rule for x^2 over n cells of size h gives a^3 / 12 + a h^2 / 6."""
     bar = build_lattice(
         cages_of(block(3, across, across)), Material(density=DENSITY, young_modulus=E)
     )

@@ -1,4 +1,4 @@
-"""The material against elasticity: constants, a clamped beam, free flight."""
+"""The springs against elasticity: constants, a clamped beam, free flight."""
 
 from functools import cache
 
@@ -33,7 +33,7 @@ def test_the_matrix_is_the_products_own_hessian_at_rest(poisson: float | None):
 @laws
 @pytest.mark.parametrize("name", STRAINS)
 def test_elastic_constants_in_every_direction(name: str, poisson: float | None):
-    """C11 = 6/5 E, C12 = C44 = 2/5 E, of a whole block with its boundary."""
+    """C11 = 6/5 E and C12 = C44 = 2/5 E for a whole block with its boundary."""
     G, other, exact = STRAINS[name]
     lattice = study.box((5, 4, 4), 0.1, poisson)
     assert elastic_constant(lattice, G, other) == pytest.approx(exact, rel=1e-10)
@@ -44,10 +44,9 @@ def test_elastic_constants_in_every_direction(name: str, poisson: float | None):
 
 @pytest.mark.parametrize("across", ACROSS)
 def test_the_excess_stiffness_is_that_of_cells_that_cannot_curve(across: int):
-    """E I (1 + 169/140 (h/b)^2).
+    """The stiffness is E I (1 + 169/140 (h/b)^2), except for the effect of the clamp.
 
-    The rest is the clamp, which holds the width, too: 0.7% by scikit-fem, twice as much at two
-    cells across.
+    The clamp also holds the width: this is 0.7% by scikit-fem, twice as much at two cells across.
     """
     sag, frequency = lattice_beam(across)
     assert -0.015 < sag / study.timoshenko_sag(across) - 1 < 0
@@ -58,11 +57,10 @@ def test_the_excess_stiffness_is_that_of_cells_that_cannot_curve(across: int):
 
 
 def free_flight(t: float, shake: float, error: float, poisson: float | None) -> tuple[float, float]:
-    """Return the drift of momentum and the loss of angular momentum in a second, of a block that
-    spins at 2 rad/s.
+    """Return a spinning block's drift of momentum and loss of angular momentum in a second.
 
-    shake : standard deviation of random node velocities [m/s]. A body that stays symmetric about
-            its middle keeps its momentum whatever the solver does, a shaken body need not
+    shake : standard deviation of random node velocities [m/s]; without it the block stays symmetric
+            and keeps its momentum with any solver
     """
     lattice, throw = study.box((4, 3, 2), 0.1, poisson), np.array([0.6, -0.48, 0.64])
     mass, q = lattice.mass, lattice.nodes
@@ -87,8 +85,8 @@ def test_a_shaken_body_keeps_its_momentum_however_loose_its_steps(
 ):
     """Every cell gives each of its corners the same mass and the same diagonal entry of L.
 
-    So Jacobi's preconditioner is a multiple of M, and CG brings in no net force however early it
-    stops. A start from q_n would, but is not used here.
+    So Jacobi's preconditioner is a multiple of M, and CG adds no net force even if it stops early.
+    A start from q_n would add a force, but is not used here.
     """
     assert free_flight(1 / 100, 0.1, error, poisson)[0] < 1e-12
 
@@ -96,9 +94,9 @@ def test_a_shaken_body_keeps_its_momentum_however_loose_its_steps(
 def rigid_loss(angle: float, steps: int) -> float:
     """Return the share of angular momentum that implicit Euler takes from a rigid body.
 
-    It turns by ``angle`` a step. Central forces make no torque, so sum_i x_(n+1) x M (x_(n+1) - 2
-    x_n + x_(n-1)) = 0. For the n-th turn a_n this is sin(a_n + a_(n-1)) = 2 sin a_n. The momentum
-    goes as sin a_n, and da/dn = -a^3 for small turns.
+    The body turns by ``angle`` per step. Central forces make no torque, so sum_i x_(n+1) x M
+    (x_(n+1) - 2 x_n + x_(n-1)) = 0. For the n-th turn a_n this is sin(a_n + a_(n-1)) = 2 sin a_n.
+    The momentum goes as sin a_n, and da/dn = -a^3 for small turns.
     """
     last = angle
     for _ in range(steps):
@@ -108,7 +106,7 @@ def rigid_loss(angle: float, steps: int) -> float:
 
 @laws
 def test_a_spin_loses_what_implicit_euler_takes_from_a_rigid_body(poisson: float | None):
-    """7.15% in a second by steps of 1/50 s."""
+    """The loss is 7.15% in a second with steps of 1/50 s."""
     assert free_flight(1 / 50, 0.0, 1e-10, poisson)[1] == pytest.approx(
         rigid_loss(2 / 50, 50), abs=1e-4
     )

@@ -1,5 +1,4 @@
-"""Bodies of several materials: shares of cells in springs and masses, bars against closed forms,
-extreme ratios."""
+"""Bodies of several materials: springs and masses, bars against closed forms, extreme ratios."""
 
 from pathlib import Path
 
@@ -37,8 +36,7 @@ def test_each_cell_gives_its_own_mass_to_its_corners(tmp_path: Path):
 
 
 def test_each_cell_gives_its_share_to_its_springs(tmp_path: Path):
-    """A spring inside a part is as of a body of that alone; in the plane between two it has half of
-    each."""
+    """A spring in a part is that of a body of this part; in an interface it takes half of each."""
     stiffer = {"young_modulus": 5 * YOUNG}
     lattice, soft, stiff = (
         of_parts(tmp_path, *parts).lattice
@@ -70,7 +68,7 @@ def test_the_last_part_of_a_cell_wins_key_by_key(tmp_path: Path):
 
 
 def test_painted_cells_are_a_part(tmp_path: Path):
-    """Each of the eight corners of the surface lies in a cell of its own."""
+    """Each of the eight corners of the surface lies in its own cell."""
     lattice = of_parts(
         tmp_path, {"region": {"painted": [0, 1, 2, 3, 4, 5, 6, 7]}, "density": 9 * DENSITY}
     ).lattice
@@ -98,8 +96,10 @@ def forces(model: Model, displacement: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("ratio", [0.1, 4.0, 1e3])
 @pytest.mark.parametrize("sign", [1, -1])
 def test_halves_one_behind_the_other_are_springs_in_series(tmp_path: Path, ratio: float, sign: int):
-    """Sides held, so that C11 = 6/5 E counts: the same stress in both, strains as 1 / E; no net
-    force between."""
+    """With held sides C11 = 6/5 E counts: stresses are equal, strains go as 1 / E.
+
+    No net force acts on the nodes in between.
+    """
     model = of_parts(tmp_path, {"region": FAR, "young_modulus": ratio * YOUNG})
     x, strain = model.lattice.nodes[:, 0], sign * 1e-6
     moved = np.zeros_like(model.lattice.nodes)
@@ -116,8 +116,7 @@ def test_halves_one_behind_the_other_are_springs_in_series(tmp_path: Path, ratio
 
 @pytest.mark.parametrize("ratio", [0.1, 1e6])
 def test_halves_side_by_side_are_springs_in_parallel(tmp_path: Path, ratio: float):
-    """Both narrow by 1/4 of the strain: nothing pulls across, at the surface or between, and E is
-    the mean."""
+    """Both halves narrow by 1/4 of the strain, so no force acts across, and E is the mean."""
     model = of_parts(tmp_path, {"region": BACK, "young_modulus": ratio * YOUNG})
     nodes, strain = model.lattice.nodes, 1e-7
     force = forces(model, strain * nodes * [1, -1 / 4, -1 / 4])
@@ -136,9 +135,9 @@ def test_halves_side_by_side_are_springs_in_parallel(tmp_path: Path, ratio: floa
 
 
 def test_a_part_heavier_by_a_million_keeps_its_way_and_the_light_one_follows(tmp_path: Path):
-    """The heavy half, thrown, has nearly all momentum.
+    """The heavy half, thrown, has nearly all of the momentum.
 
-    Steps are so long that the light half does not swing any more.
+    Steps are so long that the light half does not oscillate any more.
     """
     path = block_scene(
         tmp_path,

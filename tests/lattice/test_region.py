@@ -1,4 +1,4 @@
-"""Which nodes a region means: by the material that they carry, not by where they stick out to."""
+"""A region selects nodes by the material that they carry, not by their own positions."""
 
 import logging
 from functools import cache
@@ -25,20 +25,22 @@ def pinned(model: Model) -> np.ndarray:
 
 @pytest.mark.parametrize("cells", [256, 882])
 def test_a_relative_box_up_to_one_holds_what_sticks_out(tmp_path, cells):
-    """README's own pin: it left out the outermost nodes."""
+    """A relative box up to 1 also holds the outermost nodes, which protrude from the body."""
     sides = np.array([0.5, 0.1, 0.1])
     upper = {"region": {"box": [[0, 0, 0.8], [1, 1, 1]], "relative": True}}
     path = block_scene(tmp_path, sides, time=TIME, cages={"count": cells}, pin=[upper])
     model = model_of(path)
     nodes = model.lattice.nodes
-    # some nodes stick out of the body
+    # some nodes protrude from the body
     assert nodes[:, 2].max() > sides[2]
     np.testing.assert_array_equal(model.lattice.pinned, nodes[:, 2] >= 0.8 * sides[2] - 1e-9)
 
 
 def test_a_plane_that_grazes_a_body_clamps_what_it_touches(caplog):
-    """Nodes below parts that are only near the plane were pinned, too: 67 of 91, and the body 10
-    times too stiff."""
+    """A plane holds only nodes of the part that it touches, not nodes below parts near it.
+
+    Those nodes made 67 of 91 pinned, and the body 10 times too stiff.
+    """
     path = CASES / "bunny_grazing_pin.toml"
     model = model_of(path)
     surface = read_surface(CASES / "bunny_cut.ply")
@@ -68,15 +70,17 @@ def test_what_is_led_or_pushed_is_what_would_be_pinned(kind, more):
     ("law", "low", "high"), [("neo-hookean", 0.93, 1.05), ("linear", 0.7, 1.0)]
 )
 def test_a_plane_that_grazes_a_body_leaves_it_as_soft_as_it_is(law, low, high):
-    """Work of the weight: 9.65e-5 J by 11,206 quadratic tetrahedra (scikit-fem), clamped where they
-    touch the plane."""
+    """The work of the weight is 9.65e-5 J by 11,206 quadratic tetrahedra (scikit-fem).
+
+    They are clamped where they touch the plane.
+    """
     _, (first, *_, last) = play(CASES / "bunny_grazing_pin.toml", f"material.law={law}")
     assert low < (first.potential - last.potential) / 9.65e-5 < high
 
 
 @pytest.mark.parametrize("kind", ["pin", "anchor", "force", "part"])
 def test_a_region_without_material_says_where_the_body_is(tmp_path, kind):
-    # only nodes that stick out of the body
+    # only nodes that protrude from the body
     table = {"region": {"box": [[0, 0, 0.251], [1, 1, 2]]}}
     own = {
         "anchor": {"path": [{"time": 1, "by": [0, 0, 1]}]},
@@ -92,8 +96,10 @@ def test_a_region_without_material_says_where_the_body_is(tmp_path, kind):
 
 @pytest.mark.parametrize("held", [1.0, 0.0], ids=["plane through cells", "end face"])
 def test_a_tilted_clamp_converges_in_second_order(held):
-    """A round bar tilted about two axes. By nodes' positions it was +7% to +20% too soft at R/4, of
-    first order."""
+    """A round bar tilted about two axes has errors of second order.
+
+    With nodes selected by position it was 7 to 20% too soft at R/4, of first order.
+    """
     sizes = (4, 8)
     errors = study.clamp_errors(sizes, limit(), held)
     assert np.abs(errors).max() < 0.03

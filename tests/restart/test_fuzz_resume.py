@@ -1,4 +1,4 @@
-"""Damaged and hostile result files for run --resume: it resumes, or refuses in one line."""
+"""Damaged and hostile result files: run --resume continues, or refuses in a line."""
 
 import re
 import signal

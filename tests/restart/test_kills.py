@@ -1,5 +1,4 @@
-"""Runs killed by SIGKILL at random moments, resumed, killed again: no frame is lost, and the end is
-the same."""
+"""Runs killed by SIGKILL at random moments and resumed lose no frame and end the same."""
 
 import random
 import re
@@ -23,15 +22,14 @@ pytestmark = pytest.mark.slow
 
 
 def run_killed(ranks: int, seconds: float, *arguments: object) -> subprocess.CompletedProcess:
-    """Return a run whose rank 0 died after so many seconds of CPU time, or that had ended
-    before."""
+    """Return a run whose rank 0 died after so many seconds of CPU time, or that ended before."""
     done = run(ranks, WORKERS / "killed_worker.py", seconds, *arguments)
     assert done.returncode in (0, 128 + signal.SIGPROF), done.stderr
     return done
 
 
 def frames_left(path: Path, whole: Path, least: int) -> int:
-    """Return the number of frames; they agree with frames of a run that was never killed."""
+    """Return the number of frames; check that they agree with a run that was never killed."""
     if not path.exists():
         assert least == 0
         return 0
@@ -46,7 +44,7 @@ def frames_left(path: Path, whole: Path, least: int) -> int:
 
 @pytest.mark.parametrize(("ranks", "kills", "steps"), [(1, 24, 150), (2, 6, 40)])
 def test_killed_at_any_moment(tmp_path: Path, ranks: int, kills: int, steps: int):
-    """While it is set up, runs, goes on, and makes room for more frames than were planned."""
+    """Kills come in the set-up, in steps, after a resume, and while the file is extended."""
     scene = hanging(tmp_path, steps, output={"surface": False})
     path, chance, at = tmp_path / "x.h5", random.Random(ranks), []
     longer = ["--force", "--set", f"time.duration={0.015 * steps}"]
@@ -54,7 +52,7 @@ def test_killed_at_any_moment(tmp_path: Path, ranks: int, kills: int, steps: int
     for whole, more in runs.items():
         done = run_killed(ranks, 0, "run", scene, "-o", whole, *more[1:])
         seconds = float(done.stdout.split()[-1])
-    # again and again from the start
+    # repeatedly from the start
     while len(at) < kills:
         path.unlink(missing_ok=True)
         count = 0

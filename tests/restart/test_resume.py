@@ -1,5 +1,4 @@
-"""Runs that go on from a checkpoint: exactly, on other ranks, with another scene, in a file that
-has no room."""
+"""Runs that go on from a checkpoint: exactly, on other ranks, with another scene, without room."""
 
 import json
 import multiprocessing
@@ -106,7 +105,7 @@ CASES = {
         # anderson diverges there
         if preset != "anderson"
     },
-    # the estimate at a start depends on the earlier preconditioner
+    # the estimate at the start depends on the earlier preconditioner
     "loose, pressed": fall(
         solver={"preset": "newton", "error": 0.3},
         obstacle=PRESSING,
@@ -125,7 +124,7 @@ CASES = {
         solver=solver("anderson"),
         start={"scatter": 0.9},
         safety={"on_failure": "substep"},
-        # pieces of an eighth and more, with which the next step begins
+        # the next step begins with pieces of an eighth or more
         material=SOFT | {"young_modulus": 1e6},
     ),
     "fallback, scattered": swing(
@@ -158,7 +157,7 @@ BLOCK = {
 }
 TIP = {"box": [[0.74, -1, -1], [0.76, 1, 1]]}
 TIP_LED = [{"region": TIP, "path": [{"time": 0.08, "by": [0.05, 0, 0.05]}], "stop": 0.1}]
-# the places where hierarchies are built
+# positions where hierarchies are built
 MULTIGRID = {
     "solid, pressed": fall(**BLOCK | {"material": solid_of(1e5)}, obstacle=PRESSING),
     "bdf2, pressed": by("bdf2", fall(**BLOCK, obstacle=PRESSING)),
@@ -179,7 +178,7 @@ QUICK = {"solid, pressed", "fallback"}
     [case if case in QUICK else pytest.param(case, marks=pytest.mark.slow) for case in MULTIGRID],
 )
 def test_the_hierarchy_of_then_is_built_again(tmp_path, case: str, monkeypatch):
-    """In runs that build hierarchies in some steps only: of several levels, given up soon."""
+    """Resume runs that build hierarchies in some steps only: of several levels, or given up."""
     monkeypatch.setattr(cycle, "COARSEST", 10)
     monkeypatch.setattr(preconditioning, "WORTH", 1.0)
     built, build = [], LatticePreconditioner._build
@@ -213,7 +212,7 @@ LONGER = "--set", "time.duration=0.56"
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Never stopped; every third step also solved to rounding."""
+    """Return a run that is never stopped; every third step is also solved to rounding."""
     folder = tmp_path_factory.mktemp("whole")
     assert status_of("run", hanging(folder), "-o", folder / "whole.h5", "--true-error", 3) == 0
     return folder / "whole.h5"
@@ -221,7 +220,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def longer(whole: Path) -> Path:
-    """The same of 56 steps."""
+    """Return the same run of 56 steps."""
     words = "-o", whole.with_name("longer.h5"), "--true-error", 3, *LONGER
     assert status_of("run", whole.with_name("scene.toml"), *words) == 0
     return whole.with_name("longer.h5")
@@ -229,7 +228,7 @@ def longer(whole: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def after_ten(whole: Path) -> Path:
-    """The same, stopped after ten steps."""
+    """Return the same run stopped after ten steps."""
     with pytest.MonkeyPatch.context() as patch:
         signal_after(patch, 10, signal.SIGUSR1)
         words = "-o", whole.with_name("stopped.h5"), "--true-error", 3
@@ -253,7 +252,7 @@ def test_what_was_asked_for_beside_the_frames_is_there_after_going_on(whole: Pat
 
 
 def test_frames_after_the_checkpoint_are_kept_as_they_are(whole: Path, tmp_path, monkeypatch):
-    """With a checkpoint at the start alone and a failure later, not a frame is written again."""
+    """Old frames are not written again if the only checkpoint is at the start."""
     path = tmp_path / "x.h5"
 
     def killed() -> None:
@@ -319,9 +318,9 @@ def test_other_options_of_petsc_are_refused_unless_they_only_tell(whole: Path):
 
 
 def test_a_longer_run(whole: Path, stopped: Path, longer: Path, tmp_path):
-    """A longer run from a stopped and from a finished file.
+    """A longer run continues from a stopped and from a finished file.
 
-    The 40th step had a frame as the last step; now it has none.
+    The 40th step, the last, had a frame; in the longer run it has none.
     """
     for path in (stopped, shutil.copy(whole, tmp_path)):
         assert status_of("run", "--resume", path, *LONGER, "--force") == 0
@@ -336,7 +335,7 @@ def test_a_longer_run(whole: Path, stopped: Path, longer: Path, tmp_path):
 def left_by_a_kill(
     monkeypatch: pytest.MonkeyPatch, step: int, path: Path, *arguments: object
 ) -> None:
-    """The run's file as a kill after that step would leave it."""
+    """Return the run's file as a kill after that step would leave it."""
     left: list[bytes] = []
     with monkeypatch.context() as patch:
         at_step(patch, step, lambda: left.append(path.read_bytes()))
@@ -348,7 +347,7 @@ def left_by_a_kill(
 def test_a_longer_run_after_a_stop_between_frames_and_a_kill(
     stopped: Path, longer: Path, monkeypatch, killed
 ):
-    """The effort since the frame before the checkpoint counts, whatever frames came after it."""
+    """Costs since the frame before the checkpoint count, whatever frames came later."""
     words = "run", "--resume", stopped, "--checkpoint-every", 1000
     left_by_a_kill(monkeypatch, killed, stopped, *words)
     with h5py.File(stopped) as file:
@@ -382,7 +381,7 @@ def test_a_run_cannot_end_before_its_checkpoint(stopped: Path, capsys):
 def test_another_start_takes_no_frame_of_before_the_first_checkpoint(
     whole: Path, tmp_path, monkeypatch
 ):
-    """Killed between frame 0 and the first checkpoint."""
+    """The run was killed between frame 0 and the first checkpoint."""
     path, other = tmp_path / "x.h5", ["--set", "start.velocity=[1.0, 0.0, 0.0]"]
     scene = whole.with_name("scene.toml")
     left_by_a_kill(monkeypatch, 0, path, "run", scene, "-o", path, "--frames", 3)
@@ -425,7 +424,7 @@ def test_other_painted_points_are_refused_in_one_line(tmp_path, monkeypatch):
 def test_positions_that_no_frame_knows_are_refused(
     whole: Path, tmp_path, monkeypatch, name, step, value
 ):
-    """After step 9, of which there is a frame, and step 10, of which there is none."""
+    """Resume after step 9, which has a frame, and after step 10, which has none."""
     path = tmp_path / "x.h5"
     with monkeypatch.context() as patch:
         signal_after(patch, step, signal.SIGUSR1)
@@ -441,7 +440,7 @@ def test_positions_that_no_frame_knows_are_refused(
 def test_a_file_cannot_name_meshes_of_another_folder(
     whole: Path, stopped: Path, tmp_path, lies_there: str
 ):
-    """The folder that the file names is not trusted: it must hold the scene that names the mesh."""
+    """The folder that the file names must contain the scene that names the mesh."""
     other = tmp_path / "other"
     other.mkdir()
     shutil.copy(whole.parent / "scene.ply", other / "scene.ply")
@@ -462,7 +461,7 @@ def test_a_file_cannot_name_meshes_of_another_folder(
 def test_a_file_cannot_make_a_run_do_more_than_solve(
     stopped: Path, tmp_path, monkeypatch, option: str
 ):
-    """Options without effect on results are dropped. Options that choose no solver are refused."""
+    """Options without effect on results are dropped; options that choose no solver are refused."""
     monkeypatch.chdir(tmp_path)
     with h5py.File(stopped, "r+") as file:
         file.attrs["petsc_options"] = option
@@ -494,7 +493,7 @@ def test_a_file_that_is_being_written_is_left_alone(stopped: Path):
 
 
 def take_and_free(path: Path, times: int, twice) -> None:
-    """Take and free a lock many times. A file for its holder alone reveals a second holder."""
+    """Take and release a lock many times; a file written by its holder reveals a second holder."""
     from msmpetsc.results.disk import Lock
 
     for _ in range(times):
@@ -541,7 +540,7 @@ def stopped_and_whole(ranks: int, step: int, scene: Path, *words: object) -> lis
 
 
 def test_on_two_ranks_exactly_and_on_another_number_closely(tmp_path):
-    """Stopped on two ranks after its fifth step, then resumed on two ranks and on a single rank."""
+    """A run stopped on two ranks after its fifth step resumes on two ranks and on a single rank."""
     scene = hanging(tmp_path, 12, solver={"preset": "newton", "error": 1e-10})
     path, whole = stopped_and_whole(2, 5, scene)
     other = shutil.copy(path, tmp_path / "y.h5")

@@ -1,4 +1,4 @@
-"""Faults that a run notices in its steps, and its response to a failed step."""
+"""Faults that a run detects in its steps, and its response to a failed step."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -30,7 +30,7 @@ def of(frames: list[Frame], name: str) -> np.ndarray:
 def test_a_swing_gains_nothing(tmp_path: Path, integrator: str):
     """Implicit Euler only loses energy.
 
-    Explicit substeps and BDF2 vary around the energy by a few percent.
+    With explicit substeps and BDF2 the energy varies by a few percent.
     """
     _, frames = play(beam(tmp_path, time=TIME | {"integrator": integrator}))
     # energy from the weight [J]
@@ -44,7 +44,7 @@ def test_a_swing_gains_nothing(tmp_path: Path, integrator: str):
 
 @pytest.mark.parametrize("integrator, share", [("implicit-euler", 1e-6), ("bdf2", 0.01)])
 def test_a_led_and_dragged_body_gains_nothing(tmp_path: Path, integrator: str, share: float):
-    """Work of anchors and obstacles counts: a rough plate is pressed in and pulled away."""
+    """The work of anchors and obstacles counts: a rough plate is pressed in and pulled away."""
     time = TIME | {"integrator": integrator, "step": STEP / 4 if integrator == "bdf2" else STEP}
     floor = plane_at(response="penalty", friction=0.8)
     floor |= {"path": [{"time": 0.05, "by": [0, 0, 0.01]}, {"time": 0.1, "by": [0.4, 0, 0.01]}]}
@@ -73,8 +73,7 @@ class Overshooting:
 def test_a_run_that_gains_energy_without_end_is_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Forces that act three times as long as they should, at steps far beyond the explicit
-    limit."""
+    """Forces act three times as long as they should, in steps far beyond the explicit limit."""
     Overshooting(monkeypatch, 2.0)
     told = (
         r"frame \d+ \(.* gained .* J from nowhere, of .* J that were there: worst at node \d+, "
@@ -87,7 +86,7 @@ def test_a_run_that_gains_energy_without_end_is_stopped(
 
 @pytest.mark.parametrize("way", ["fallback", "substep"])
 def test_rescue_carries_such_a_run_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str):
-    """The steps that gained too much are taken again, and the beam stays together."""
+    """Steps that gained too much energy are repeated, and the beam stays together."""
     Overshooting(monkeypatch, 2.0)
     _, frames = play(
         beam(tmp_path, time={"step": STEP, "duration": 0.5}), f"safety.on_failure={way}"
@@ -111,8 +110,7 @@ def test_a_step_that_is_not_finite_fails(tmp_path: Path, monkeypatch: pytest.Mon
 def test_inverted_cells_are_counted_and_told_with_their_place(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ):
-    """A mirrored block is at rest for its springs: all 32 cells stay inside out, and it says so
-    once."""
+    """All 32 cells of a mirrored block stay inverted, which a warning says once."""
     scene = block_scene(tmp_path, time=TIME, start={"scale": [-1.0, 1.0, 1.0]})
     _, frames = play(scene)
     assert of(frames, "inverted").tolist() == [32] * (STEPS + 1)
@@ -128,7 +126,7 @@ def test_inverted_cells_are_counted_and_told_with_their_place(
 
 
 def test_only_the_cell_that_is_turned_is_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture):
-    """A corner of a block is led through its cell to the far side of the opposite corner."""
+    """A corner of a block is moved through its cell beyond the opposite corner."""
     corner = {"region": {"sphere": {"center": [0, 0, 0], "radius": 0.01}}}
     corner["path"] = [{"time": STEP, "by": [1.2 * CELL] * 3}]
     _, frames = play(
@@ -168,8 +166,11 @@ def test_stop_is_the_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
 def test_a_failed_step_is_halved_and_whole_steps_follow(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Call 3 is step 3 as a whole, call 4 its first half, call 5 the first quarter: then a half and
-    a quarter; step 4 in halves, and whole steps again."""
+    """Step 3 fails as a whole and as a half, then succeeds in two quarters and a half.
+
+    Call 3 is the whole step, call 4 its first half, call 5 the first quarter. Step 4 is taken in
+    halves, then steps are whole again.
+    """
     failing = Failing(monkeypatch, {3, 4})
     _, frames = play(beam(tmp_path), "safety.on_failure=substep")
     assert (
@@ -182,8 +183,7 @@ def test_a_failed_step_is_halved_and_whole_steps_follow(
 def test_steps_in_halves_are_those_of_half_the_time_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """A rescued first step is two steps of t / 2 of another run, to the solver's error; and so is
-    its velocity."""
+    """A rescued first step equals two steps of t / 2 in position and velocity."""
     scene = beam(tmp_path)
     _, half = play(scene, f"time.step={STEP / 2}")
     Failing(monkeypatch, {1})
@@ -213,7 +213,7 @@ def test_what_no_halving_mends_stops_with_the_number_of_pieces(
 
 
 def test_a_rescued_explicit_or_bdf2_step_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """BDF2 begins anew after the step, so the error is still that of a step of first order."""
+    """BDF2 begins anew after the step, so the error is still that of a first-order step."""
     scene = beam(tmp_path, time=TIME | {"integrator": "bdf2"})
     _, usual = play(scene)
     Failing(monkeypatch, {4})

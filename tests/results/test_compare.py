@@ -1,4 +1,4 @@
-"""msmpetsc compare: errors by its formulas, and the first frame and node that differ."""
+"""msmpetsc compare: its errors by their formulas, and the first frame and node that differ."""
 
 import re
 from pathlib import Path
@@ -32,7 +32,7 @@ def a(bar_result: Path) -> Path:
 
 
 def changed(tmp_path: Path, index: int, **values) -> Path:
-    """A result whose frame `index` has other values."""
+    """Return a result whose frame ``index`` has other values."""
     frames = [frame(i, **(values if i == index else {})) for i in range(FRAMES)]
     return small_result.write(tmp_path / "b.h5", frames)
 
@@ -99,7 +99,7 @@ def test_errors_are_relative_to_what_is_stated(
     a: Path, tmp_path: Path, name: str, value, error: float
 ):
     errors = error_of(a, changed(tmp_path, 3, **{name: value}), name)
-    # the surface has six digits or so
+    # the surface has about six digits
     assert errors == pytest.approx([0, 0, 0, error, 0], rel=1e-4 if name == "surface" else 1e-9)
 
 
@@ -127,8 +127,7 @@ def test_nan_equals_nan_and_nothing_else(a: Path, tmp_path: Path, capsys):
 
 
 def test_rounding_is_no_difference(tmp_path: Path):
-    """A body at rest: its displacements and energies are rounding, and the surface has single
-    precision."""
+    """A body at rest moves by rounding, and its surface is in single precision."""
     still = dict(kinetic=0.0, elastic=1e-30, potential=0.0, momentum=np.zeros(3))
 
     def written(sign: int, **other) -> Path:
@@ -188,8 +187,7 @@ def test_other_lattices_are_refused_with_the_reason(
 
 
 def other_lattice(path: Path, by: float = 0.0, points: np.ndarray = POINTS) -> Path:
-    """A run of the same mesh on a lattice twice as coarse; from frame 2 on its surface point 3 is
-    off by so much."""
+    """Return a run on a lattice twice as coarse; from frame 2 on, surface point 3 is displaced."""
     frames = [frame(i, surface=points + 0.01 * i * small_result.X) for i in range(FRAMES)]
     for one in frames[2:]:
         one.surface[3, 1] += by
@@ -249,5 +247,5 @@ def test_odd_options_are_refused(a: Path, options: list[str]):
 
 @pytest.mark.parametrize("shape", [(0,), (0, 3)])
 def test_no_rows_agree(shape: tuple[int, ...]):
-    """As those of a rank without a pin."""
+    """Arrays without rows agree, as for a rank without a pin."""
     assert rows_agree(np.zeros(shape), np.zeros(shape), 0.0).shape == (0,)

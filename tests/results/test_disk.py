@@ -1,7 +1,4 @@
-"""A disk that is full or write-protected: a line and exit status 2.
-
-The run goes on when there is room.
-"""
+"""A full or write-protected disk gives a line and exit status 2; with room the run continues."""
 
 import subprocess
 from collections.abc import Iterator
@@ -29,7 +26,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A file system of 4 MB of its own."""
+    """Yield a file system of 4 MB of its own."""
     folder = tmp_path / "disk"
     folder.mkdir()
     mounted = subprocess.run(

@@ -1,7 +1,4 @@
-"""Damaged or hostile result files: they are read or refused in a line.
-
-No file beside them is opened.
-"""
+"""Damaged or hostile result files are read or refused in a line; no other file is opened."""
 
 import argparse
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""msmpetsc.open returns the content of running and of old files; a bad file ends in a line."""
+"""msmpetsc.open reads running and old files; a bad file gives a line of error."""
 
 import sys
 from collections.abc import Callable

@@ -76,7 +76,7 @@ def test_log_lines_stand_above_the_bar_and_not_in_it(monkeypatch):
     bar.close()
     log.warning("afterwards")
     screen = terminal.getvalue().split("\n")
-    # the bar was wiped out before the warning
+    # the bar was erased before the warning
     assert screen[0].split("\r")[-1] == "a cell is inside out"
     assert "0/10" in screen[1] and "\r" in screen[1] and screen[-2] == "afterwards"
     assert log.handlers is handlers

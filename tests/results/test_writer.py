@@ -56,7 +56,7 @@ def assert_holds(file: h5py.File, count: int, surface: str | None = "f8") -> Non
 
 
 def newest_checkpoint(file: h5py.File) -> tuple[int, np.ndarray, np.ndarray] | None:
-    """Step, q and q_previous, of a file that need not have a path."""
+    """Return step, q and q_previous of a file's newest checkpoint; it need not have a path."""
     group = file["checkpoint"]
     slot = newest_slot(group["step"][:])
     return (
@@ -66,7 +66,7 @@ def newest_checkpoint(file: h5py.File) -> tuple[int, np.ndarray, np.ndarray] | N
 
 @pytest.mark.parametrize("ranks", [1, 3])
 def test_layout_is_that_of_the_design_on_any_ranks(tmp_path, ranks):
-    # the run makes the folder
+    # the run creates the folder
     run_on_ranks(ranks, "all", tmp_path / "out" / "x.h5")
     assert os.listdir(tmp_path / "out") == ["x.h5"]
     with h5py.File(tmp_path / "out" / "x.h5") as file:
@@ -105,7 +105,10 @@ def test_layout_is_that_of_the_design_on_any_ranks(tmp_path, ranks):
 
 
 def test_who_writes_does_not_show_in_the_file(tmp_path):
-    """Rank 0 for all, or each its own rows, which begin and end within chunks: the same bytes."""
+    """The bytes are equal, whether rank 0 writes for all or each rank writes its own rows.
+
+    The rows of a rank begin and end within chunks.
+    """
     for ranks, action in ((1, "all"), (3, "all"), (3, "gathered")):
         run_on_ranks(ranks, action, tmp_path / f"{ranks} {action}.h5")
     one, *others = [path.read_bytes() for path in sorted(tmp_path.glob("*.h5"))]
@@ -113,7 +116,7 @@ def test_who_writes_does_not_show_in_the_file(tmp_path):
 
 
 def test_no_write_leaves_a_broken_file(tmp_path, monkeypatch):
-    """Every write of HDF5 is replayed: the file after each opens and holds all finished frames."""
+    """After each replayed write of HDF5 the file opens and holds all finished frames."""
     disk = Disk()
     path = tmp_path / "x.h5"
 
@@ -143,7 +146,7 @@ def test_no_write_leaves_a_broken_file(tmp_path, monkeypatch):
 
 
 def test_going_on_writes_nothing_but_numbers_in_their_places(tmp_path, monkeypatch):
-    """As above, from the opening of a file that was left by a kill, until it is closed."""
+    """The same holds from the opening of a file that a kill has left until it is closed."""
     path, disk = tmp_path / "x.h5", Disk()
     with ResultFile(path, MPI.COMM_SELF, {}) as file:
         file.start_frames(9, NODES, {"surface": POINTS})
@@ -219,7 +222,7 @@ class Disk(io.BytesIO):
         self.seek(here)
 
     def images(self, start, begin=b""):
-        """(number of changes made, content) after each change from the start-th on."""
+        """Yield (number of changes made, content) after each change from the start-th on."""
         image = bytearray(begin)
         for number, change in enumerate(self.log, 1):
             end = change if isinstance(change, int) else change[0] + len(change[1])

@@ -1,4 +1,4 @@
-"""Every writer on a full disk says so in a line and leaves no half-written file.
+"""Every writer on a full disk says so in a line and leaves no incomplete file.
 
 A limit on the size of files stands for the full disk. The system reports both alike, and the limit
 needs no rights.
@@ -52,7 +52,7 @@ class Writer(NamedTuple):
 
 @pytest.fixture(scope="module")
 def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with results to be drawn and exported."""
+    """Return a folder with results to draw and export."""
     folder = tmp_path_factory.mktemp("sources")
     small_result.write(folder / "bar.h5")
     write_ball(folder / "ball.h5")
@@ -78,9 +78,9 @@ def chart(path: Path) -> None:
 
 
 def ask_for_no_cases(path: Path) -> None:
-    """Write a study file whose cases are all for --full.
+    """Write a study file whose cases all need --full.
 
-    run_study stores its request and runs nothing.
+    So run_study stores its request and runs nothing.
     """
     scene = ROOT / "scenes" / "studies" / "beam_soft.toml"
     text = f'[[scene]]\nname = "a"\nfile = "{scene}"\n[[sweep]]\nfull = true\n'
@@ -88,7 +88,7 @@ def ask_for_no_cases(path: Path) -> None:
 
 
 def writers(sources: Path) -> dict[str, Writer]:
-    """The table, by names of files."""
+    """Return the writers by names of their files."""
     bar, ball = sources / "bar.h5", sources / "ball.h5"
     table = {
         "x.h5": Writer("results/writer.py", small_result.write),
@@ -134,13 +134,13 @@ NUMBERS = baseline.Numbers(
     run=baseline.Recipe(cells=None, steps=1), counts={}, scales={}, numbers={}
 )
 NAMES = [*writers(Path())]
-# writers that never end a run or need a run to be called; they use the same function
+# writers that never end a run, or that only a run can call; they use the same function
 NOT_TRIED = {"app/summary.py", "app/exported_systems.py", "cli/commands/series.py"}
 
 
 @contextmanager
 def room_for(size: int) -> Iterator[None]:
-    """No file may become longer [byte]."""
+    """Limit the length of every file [byte] within the context."""
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
     try:
@@ -155,7 +155,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_disk_that_fills_up(sources: Path, tmp_path: Path, name: str):
-    """At once, or when half is written."""
+    """Fail at the first byte, or when half is written."""
     if name.startswith("y.usd"):
         pytest.importorskip("pxr", reason="usd-core is not installed: the extra usd")
     writer = writers(sources)[name]

@@ -1,4 +1,4 @@
-"""Scene files, study files and --set values that are wrong or hostile; under mpiexec too."""
+"""Wrong or hostile scene files, study files and --set values are refused, also under mpiexec."""
 
 from pathlib import Path
 
@@ -58,7 +58,7 @@ def test_a_scene_names_no_file_outside_its_folder(folder, name):
     path = naming(folder, name)
     said = refusal(lambda: load_scene(path))
     assert "mesh.source" in said and "--set mesh.source=PATH allows it" in said
-    # the user's own name stays
+    # the user's own name remains
     assert load_scene(path, [f"mesh.source={name}"]).mesh.source == name
     assert refusal(lambda: load_scene(path, [f"mesh.source={name}"], by_user=False))
 

@@ -1,5 +1,4 @@
-"""The keys of a scene as ``msmpetsc keys`` and editors have them: each with its unit, default and
-range."""
+"""The keys of a scene in ``msmpetsc keys`` and for editors have units, defaults and ranges."""
 
 import tomllib
 

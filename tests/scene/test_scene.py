@@ -1,4 +1,4 @@
-"""Scene files: their meaning, and a plain line for every mistake."""
+"""Scene files: their meaning, and a line for every mistake."""
 
 import json
 import math
@@ -78,7 +78,7 @@ def load(folder: Path, text: str = EXAMPLE, *overrides: str) -> Scene:
 
 
 def problems(folder: Path, text: str, *overrides: str) -> list[str]:
-    """The lines of the error, without the path of the temporary folder."""
+    """Return the lines of the error, without the path of the temporary folder."""
     with pytest.raises(InputError) as caught:
         load(folder, text, *overrides)
     return str(caught.value).replace(f"{folder}/", "").split("\n")

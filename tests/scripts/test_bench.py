@@ -1,4 +1,4 @@
-"""scripts/bench.py: how figures are made of runs, and a real run."""
+"""scripts/bench.py: how figures follow from runs, and a real run."""
 
 import sys
 from pathlib import Path
@@ -18,7 +18,7 @@ COST = {
 
 
 def sample(seconds: list[float]) -> bench.Sample:
-    """Return the measurement of a run: seconds a frame, an iteration, 30 its, 60 products each."""
+    """Return a run's measurements: seconds per frame, 1 iteration, 30 KSP its, 60 products."""
     frames = {"wall_time": np.array(seconds), "step_error": np.linspace(0, 1e-4, len(seconds))}
     counts = {"iterations": 1, "ksp_its": 30, "products": 60, "proof_products": 6}
     return bench.Sample(

@@ -1,6 +1,6 @@
 """The scripts run from a clone as their README writes them, with any Python found first.
 
-scripts/setup and scripts/build_petsc_cuda have stand-ins for the programs that they call.
+scripts/setup and scripts/build_petsc_cuda call stand-ins of other programs.
 """
 
 import os
@@ -62,7 +62,8 @@ def program(folder: Path, name: str, text: str) -> None:
 
 # ---- scripts/setup
 
-# a stand-in for Python in scripts/setup: petsc4py, a venv with a copy, a pip that talks
+# a stand-in for Python in scripts/setup: petsc4py, a venv with a copy, a pip that
+# prints
 PYTHON = """case "$*" in
 "-m venv"*) mkdir -p .venv/bin && cp "$0" .venv/bin/python ;;
 *sysconfig*) echo .venv ;;
@@ -134,7 +135,7 @@ TOOLS = ("bash", "cat", "dirname", "env", "ls", "mkdir", "nproc", "paste", "real
 
 @pytest.fixture
 def bare(tmp_path: Path) -> Path:
-    """A folder of a PATH without apt-get, compilers and GPUs."""
+    """Return a folder for PATH without apt-get, compilers and GPUs."""
     folder = tmp_path / "bin"
     folder.mkdir()
     for tool in TOOLS:
@@ -145,7 +146,7 @@ def bare(tmp_path: Path) -> Path:
 def build(
     path: Path, prefix: Path, *arguments: str, **variables: str
 ) -> subprocess.CompletedProcess:
-    """The script with this PATH and prefix."""
+    """Run the script with this PATH and prefix."""
     command = ["bash", BUILD, "--prefix", prefix, *arguments]
     clean = {"PATH": str(path), "HOME": str(prefix), **variables}
     return subprocess.run(command, env=clean, capture_output=True, text=True)
@@ -189,9 +190,9 @@ def test_a_folder_of_others_is_left_alone(bare: Path, tmp_path: Path) -> None:
 
 
 def test_what_is_made_is_not_made_again(bare: Path, tmp_path: Path) -> None:
-    """Two cards of the same kind and a third card name the build.
+    """Two cards of one kind and a third card name the build.
 
-    A second call prints the exports alone.
+    A second call only prints the exports.
     """
     program(bare, "nvidia-smi", "printf '9.0\\n8.0\\n9.0\\n'")
     prefix = tmp_path / "petsc"
@@ -201,5 +202,5 @@ def test_what_is_made_is_not_made_again(bare: Path, tmp_path: Path) -> None:
     (prefix / "env").write_text("export PETSC_DIR=there\n")
     done = build(bare, prefix, "--", "--with-x=1")
     assert (done.returncode, done.stdout) == (0, "export PETSC_DIR=there\n"), done
-    # another build of PETSc, so that the compilers are searched next
+    # another build of PETSc, so the compilers are searched next
     assert build(bare, prefix, "--", "--with-x=2").returncode == 2

@@ -1,4 +1,4 @@
-"""The job scripts, carried out under mpirun with stand-ins for srun, scontrol and the program."""
+"""The job scripts run under mpirun with stand-ins for srun, scontrol and the program."""
 
 import os
 import shutil
@@ -13,7 +13,7 @@ from conftest import AS_ROOT, ROOT
 SCRIPTS = sorted((ROOT / "scripts" / "slurm").glob("*.sbatch"))
 RUNS = [path for path in SCRIPTS if path.stem != "array"]
 STAND_INS = {
-    # the options of srun aside; mpirun, too, hands USR1 to its ranks
+    # ignores the options of srun; mpirun, too, passes USR1 to its ranks
     "srun": """while [[ $1 == --* ]]; do shift; done
         exec mpirun --oversubscribe -n 2 "$@" """,
     "scontrol": 'echo "$@" >> requeued',
@@ -31,7 +31,7 @@ STAND_INS = {
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
 def test_slurm_finds_its_directives(script: Path):
-    """It stops looking at the first command."""
+    """All directives come before the first command, where Slurm stops looking."""
     directives = script.read_text().partition("set -euo pipefail")[0]
     assert "#SBATCH --signal=B:USR1@120\n" in directives and "#SBATCH --requeue\n" in directives
 
@@ -44,7 +44,7 @@ def test_shellcheck_finds_nothing():
 
 
 class Job:
-    """A script in a folder of its own, its two lines edited."""
+    """A job script in its own folder, with its two lines edited."""
 
     def __init__(self, script: Path, folder: Path):
         self.folder = folder
@@ -63,7 +63,7 @@ class Job:
         self.script.write_text("\n".join(lines))
 
     def start(self) -> subprocess.Popen:
-        """As Slurm starts it, first or again."""
+        """Start the script as Slurm does, for the first time or again."""
         array = {
             "SLURM_ARRAY_JOB_ID": "70",
             "SLURM_ARRAY_TASK_ID": "3",
@@ -93,7 +93,7 @@ class Job:
         return output
 
     def status(self) -> int:
-        """Its status, started again."""
+        """Start the script again and return its status."""
         process = self.start()
         process.communicate()
         return process.returncode

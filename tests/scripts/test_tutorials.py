@@ -1,4 +1,4 @@
-"""The tutorials of the documentation run as scripts; their own assertions check the numbers."""
+"""The tutorials run as scripts; their own assertions check the numbers."""
 
 import re
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""scripts/yardstick.py: coarse sizes against published values, by bounds from theory; its page."""
+"""scripts/yardstick.py: coarse sizes against published values, within bounds from theory."""
 
 import re
 
@@ -29,7 +29,7 @@ def test_there_are_24_public_cases_each_with_a_source_and_a_theory():
 
 
 def test_the_page_has_every_value_within_its_bound_and_explains_deviations_over_two_percent():
-    """No finer size is beyond the bound of the coarse size that the tests run."""
+    """No finer size exceeds the bound of the coarse size that the tests run."""
     rows = re.findall(r"^\| (\d+) \|(.*)\|$", PAGE.read_text(), re.MULTILINE)
     values = [(case, value) for case in CASES for value in case.value]
     assert len(rows) == len(values)

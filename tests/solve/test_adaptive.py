@@ -1,5 +1,4 @@
-"""Steps as long as the motion allows: the error that is reached, and where steps become short or
-long."""
+"""Steps as long as the motion allows: the error reached, and the places of short and long steps."""
 
 from pathlib import Path
 
@@ -21,14 +20,14 @@ LOOSE = {"preset": "newton", "error": 1e-4}
 def beam(
     folder: Path, integrator: str = "bdf2", step: float = STEP, duration: float = DURATION, **tables
 ) -> Path:
-    """A clamped beam of 32 cells that swings under its weight, some periods in ``DURATION``."""
+    """Write the scene of a clamped beam of 32 cells that swings for some periods."""
     more = {"error": tables.pop("error")} if "error" in tables else {}
     time = {"step": step, "duration": duration, "integrator": integrator} | more
     return clamped_beam(folder, **{"time": time, "solver": LOOSE} | tables)
 
 
 def error_of(model, frames: list[Frame], exact: list[Frame]) -> float:
-    """Trajectory error (study.distances), of the frames of two runs at the same times."""
+    """Return the trajectory error (study.distances) of frames of two runs at the same times."""
     assert [frame.time for frame in frames] == pytest.approx([frame.time for frame in exact])
     pairs = zip(frames, exact, strict=True)
     mass, rest = model.lattice.mass, model.lattice.nodes
@@ -38,14 +37,14 @@ def error_of(model, frames: list[Frame], exact: list[Frame]) -> float:
 
 @pytest.fixture(scope="module")
 def exact(tmp_path_factory: pytest.TempPathFactory) -> list[Frame]:
-    """By BDF2 in steps of a 16th, which is off by less than 1e-3 (as steps of a 32nd show)."""
+    """Return frames by BDF2 in steps of a 16th; by steps of a 32nd their error is below 1e-3."""
     output = {"surface": False, "every": 16}
     return play(beam(tmp_path_factory.mktemp("exact"), step=STEP / 16, output=output))[1]
 
 
 @pytest.mark.parametrize("method, order", [("implicit-euler", 1), ("bdf2", 2)])
 def test_the_local_error_of_a_swing(method: str, order: int):
-    """For x'' = -w^2 x from exact values, by the scheme's own steps.
+    """The local error of x'' = -w^2 x, by the scheme's own steps from exact values.
 
     The leading part is compared, so the ratio tends to 1.
     """
@@ -68,7 +67,7 @@ def test_the_local_error_of_a_swing(method: str, order: int):
 def test_the_error_reached_is_the_error_asked(
     tmp_path: Path, exact: list[Frame], integrator: str, error: float
 ):
-    """Within a factor of three, and so is the estimate of it."""
+    """The error is within a factor of three of the target, and so is its estimate."""
     model, frames = play(beam(tmp_path, integrator, error=error))
     reached = error_of(model, frames, exact)
     assert error / 3 < reached < 3 * error
@@ -77,9 +76,9 @@ def test_the_error_reached_is_the_error_asked(
 
 
 def test_steps_longer_than_between_frames_give_the_frames(tmp_path: Path, exact: list[Frame]):
-    """Frames 16 times as dense as the steps that 3e-2 needs.
+    """Frames are 16 times as dense as the steps that 3e-2 needs.
 
-    Most frames lie within a step, and are as accurate.
+    Most frames lie within a step, and are as accurate as the others.
     """
     dense = beam(tmp_path, step=STEP / 16, error=3e-2)
     model, frames = play(dense)
@@ -88,7 +87,7 @@ def test_steps_longer_than_between_frames_give_the_frames(tmp_path: Path, exact:
     assert 1e-2 < error_of(model, frames[::16], exact) < 9e-2
     q = np.array([frame.position for frame in frames])
     rough = np.abs(np.diff(q, 3, axis=0)).max()
-    # Straight lines between ends of steps have 0.3 here.
+    # linear interpolation between ends of steps has 0.3 here
     assert rough < 0.05 * np.abs(np.diff(q, axis=0)).max()
     energy = np.array([frame.kinetic + frame.elastic + frame.potential for frame in frames])
     assert np.abs(np.diff(energy)).max() < 0.02 * max(frame.kinetic for frame in frames)
@@ -98,10 +97,10 @@ def test_steps_longer_than_between_frames_give_the_frames(tmp_path: Path, exact:
     "start", [{"twist": {"axis": [1, 0, 0], "degrees": 120}}, {"scale": [1.3, 1, 1]}]
 )
 def test_the_estimate_of_a_bar_two_cells_across_that_is_let_go(tmp_path: Path, start: dict):
-    """Within a factor of two.
+    """The estimate is within a factor of two.
 
-    Means over neighbours remove this motion. The first step from rest looks as if its acceleration
-    were constant.
+    Means over neighbours would remove this motion. The first step from rest looks as if its
+    acceleration were constant.
     """
     tables = {
         "start": start,
@@ -137,7 +136,7 @@ LANDING = {
 @pytest.mark.slow
 @pytest.mark.parametrize("error", [3e-2, pytest.param(1e-2, marks=pytest.mark.slow)])
 def test_the_error_reached_where_a_penalty_pushes_is_the_error_asked(tmp_path: Path, error: float):
-    """Within a factor of three. Without pushes in the estimate it is 4 and 7 times the target."""
+    """The error is within a factor of three; if the estimate lacks pushes it is 4 and 7 times."""
     time = {"step": 0.02, "duration": 0.2, "integrator": "bdf2"}
     fine = block_scene(tmp_path, **LANDING, time=time | {"step": 0.02 / 64})
     exact = play(fine, "output.every=64")[1]
@@ -146,7 +145,7 @@ def test_the_error_reached_where_a_penalty_pushes_is_the_error_asked(tmp_path: P
 
 
 def ball(folder: Path, **tables) -> Path:
-    """A block that falls, and is thrown back by the ground after 0.1 s."""
+    """Write the scene of a falling block that the ground throws back after 0.1 s."""
     ground = plane_at(-0.05, response="reflect")
     time = {"step": 0.01, "duration": 0.15, "integrator": "bdf2", "error": 2e-2}
     return block_scene(
@@ -166,9 +165,9 @@ def test_a_fall_is_a_few_long_steps_and_an_impact_many_short_ones(tmp_path: Path
 
 @pytest.mark.parametrize("stop", [0.1, 0.115])
 def test_no_step_crosses_the_time_an_anchor_lets_go(tmp_path: Path, stop: float):
-    """At that time the nodes are still at the anchor's places.
+    """At the time of release the nodes are still at the anchor's positions.
 
-    A step of constant length lets them go at its start.
+    A step of constant length releases them at its start.
     """
     end = {"region": {"half_space": {"point": [0.99, 0, 0], "normal": [1, 0, 0]}}}
     anchor = [end | {"path": [{"time": stop, "by": [0, 0, 0.02]}], "stop": stop}]
@@ -194,7 +193,7 @@ def test_a_failed_step_is_taken_again_shorter(tmp_path: Path, monkeypatch: pytes
 def test_what_the_shortest_step_cannot_do_is_left_to_safety(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """The scene's step is then taken in pieces, and steps are chosen again after it."""
+    """The scene's step is then taken in pieces, and later steps are chosen again."""
     Failing(monkeypatch, {6})
     monkeypatch.setattr(adaptive, "LOWEST", 0)
     scene = beam(tmp_path, error=0.1, duration=0.4, safety={"on_failure": "substep"})

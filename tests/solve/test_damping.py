@@ -1,5 +1,4 @@
-"""Damping by the mass, and by viscosity: decay in free flight, a swing's energy, creep, a solid
-that spins."""
+"""Damping by mass and by viscosity: free flight, a swing's energy, creep, a spinning solid."""
 
 from pathlib import Path
 
@@ -26,7 +25,7 @@ def damped(
 
 
 def velocities(path: Path) -> np.ndarray:
-    """Mean velocity (frames, 3) [m/s]."""
+    """Return the mean velocities (frames, 3) [m/s]."""
     model, frames = play(path)
     return np.array([frame.momentum for frame in frames]) / model.lattice.mass.sum()
 
@@ -61,8 +60,8 @@ def test_a_swing_loses_its_energy_as_the_exponential(tmp_path: Path, integrator:
         _, frames = play(damped(tmp_path, integrator, 120, alpha=alpha, step=1 / 400, **swing))
         return np.array([frame.kinetic + frame.elastic for frame in frames])
 
-    # several oscillations: only kinetic energy is damped, which is half of the energy
-    # in the mean
+    # several oscillations: damping acts on the kinetic energy, which is half of the
+    # energy in the mean
     ratio = energy(ALPHA)[60:] / energy(0.0)[60:]
     expected = np.exp(-ALPHA * np.arange(60, 121) / 400)
     assert np.abs(ratio / expected - 1).max() < 0.1
@@ -85,8 +84,7 @@ def viscous(
 
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
 def test_a_solid_of_kelvin_and_voigt_creeps(tmp_path: Path, integrator: str):
-    """Under a force that comes at once it gives as 1 - exp(-t / beta); its inertia takes 1/70 of
-    beta."""
+    """Under a sudden force a solid yields as 1 - exp(-t / beta); inertia takes 1/70 of beta."""
     top = {"box": [[-1, -1, 0.24], [1, 1, 0.26]]}
     pulled = {"pin": [{"region": FOOT}], "force": [{"region": top, "total": [0, 0, 50.0]}]}
     model, frames = play(
@@ -105,7 +103,10 @@ def test_a_solid_of_kelvin_and_voigt_creeps(tmp_path: Path, integrator: str):
 
 
 def test_viscosity_does_not_brake_a_spin(tmp_path: Path):
-    """Stretched by its spin of 20 / s: rates in axes that did not turn along took 87% of it."""
+    """A spin of 20 / s stretches the body, and viscosity does not brake it.
+
+    With rates in fixed axes, viscosity took 87% of the spin.
+    """
     model, frames = play(
         viscous(tmp_path, "bdf2", 1 / 400, 0.25, RETARDATION, start={"spin": [0, 0, 20.0]})
     )
@@ -124,7 +125,10 @@ def test_viscosity_does_not_brake_a_spin(tmp_path: Path):
 
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
 def test_a_body_that_an_anchor_leads_as_it_flies_is_not_strained(tmp_path: Path, integrator: str):
-    """Led nodes of BDF2's first step had 1.9 times the velocity of their path."""
+    """Anchored nodes move as the body flies.
+
+    In BDF2's first step they once had 1.9 times the velocity of their path.
+    """
     start = {"start": {"velocity": SPEED}}
     path = [{"time": 1.0, "by": SPEED}]
     led = {"anchor": [{"region": {"box": [[-1, -1, -1], [0.01, 1, 1]]}, "path": path}]}
@@ -144,7 +148,7 @@ def test_viscosity_is_of_implicit_steps(tmp_path: Path, integrator: str):
 
 
 def test_a_bent_solid_that_is_let_go_creeps_back_and_gains_nothing(tmp_path: Path, caplog):
-    """The viscosity is so high that inertia is negligible. The work of the anchor counts."""
+    """Viscosity is so high that inertia is negligible. The work of the anchor counts."""
     top = {"box": [[-1, -1, 0.49], [1, 1, 0.51]]}
     anchor = {"region": top, "path": [{"time": 0.05, "by": [0.1, 0, 0]}], "stop": 0.1}
     scene = viscous(

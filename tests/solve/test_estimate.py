@@ -75,7 +75,7 @@ def test_the_estimate_is_within_three_of_the_true_error(
 
 @pytest.mark.parametrize("law", ["linear", "neo-hookean"])
 def test_with_multigrid_a_proof_is_cheap(tmp_path: Path, law: str):
-    """A share of 0.6 of all products proved these steps when each estimate was made anew."""
+    """The proof takes a small share of all products, 0.6 if each estimate begins anew."""
     scene = SCENES["swings"] | {"material": {"young_modulus": 5e5, "density": 1000.0, "law": law}}
     solver = "solver={preset='newton-multigrid', error=1e-3}"
     path = block_scene(tmp_path, gravity=GRAVITY, **scene)
@@ -90,9 +90,9 @@ def test_with_multigrid_a_proof_is_cheap(tmp_path: Path, law: str):
 
 
 def test_newtons_linear_solves_tell_the_error(tmp_path: Path):
-    """With PETSc's own test of convergence, the errors need solves of their own."""
+    """With PETSc's own convergence test errors need separate solves, which cost more products."""
     words = ["--frames", "12", "--true-error", "1", "--error", "1e-3"]
-    # |F| says little of the error of a stiff body
+    # |F| says little about the error of a stiff body
     stiff = solid_of(1e7)
     scene = SCENES["swings"] | {"material": stiff}
     path, products = block_scene(tmp_path, gravity=GRAVITY, **scene), []
@@ -107,8 +107,10 @@ def test_newtons_linear_solves_tell_the_error(tmp_path: Path):
 
 
 def test_true_errors_are_those_of_a_dense_solve_of_one_spring():
-    """A mass on a spring along z: x* in closed form, and g is a parabola, so its error is the
-    other's square."""
+    """The true error is known for a mass on a spring along z.
+
+    x* has a closed form, and g is a parabola, so the energy error is the square of the error.
+    """
     m, k, r = 0.3, 40.0, 1.0
     lattice = one_spring(m, k, r)
     stepper = Stepper(COMM, lattice, T, find_preset("newton"))
@@ -166,7 +168,7 @@ def test_what_cannot_be_measured_is_one_clear_line(tmp_path: Path, words: list[s
 
 
 def test_linear_solves_are_as_close_as_the_step_needs():
-    """A step to 1e-8 needs close solves near its end, a step to 1e-1 none."""
+    """A step to 1e-8 needs accurate solves near its end, a step to 1e-1 needs none."""
 
     def tolerances(error: float) -> list[float]:
         lattice, seen = beam(), []
@@ -186,7 +188,7 @@ def test_linear_solves_are_as_close_as_the_step_needs():
 
 @pytest.mark.slow
 def test_an_estimate_does_not_trust_a_cycle_that_smooths_nothing(tmp_path: Path):
-    """The preconditioner's norm does not see the remaining error: 0.59 was reported as 2.6e-4."""
+    """With a cycle that smooths nothing the bound by P^(-1) alone reported 0.59 as 2.6e-4."""
     held = [{"region": {"half_space": {"point": [0, 0, 0], "normal": [-1, 0, 0]}}}]
     tables = {
         "cages": {"cell_size": 0.0015}, "time": {"integrator": "static"}, "gravity": GRAVITY,

@@ -21,7 +21,7 @@ LINE = re.compile(r"^(\S.*?) +(\d+) \S+ (\S+) ")
 
 
 def logged(text: str) -> dict[str, dict[str, tuple[int, float]]]:
-    """Return for each stage of -log_view its events: count and seconds."""
+    """Return the events of each stage of -log_view, with their counts and seconds."""
     tables = text.split("\nEvent  ", 1)[1].split("Object Type", 1)[0]
     stages = {}
     for part in tables.split("--- Event Stage ")[1:]:
@@ -33,8 +33,7 @@ def logged(text: str) -> dict[str, dict[str, tuple[int, float]]]:
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, dict, dict]:
-    """Stages of the log, the measure file and the frames' numbers of a run that has a reference,
-    too."""
+    """Run with a reference; return stages of the log, the measure file and frames' numbers."""
     folder = tmp_path_factory.mktemp("run")
     words = (
         "-o",
@@ -47,7 +46,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict, dict, dict]:
         "mg",
         "-log_view",
     )
-    # These solves do not tell the error, and end so early that an estimate is needed.
+    # these solves estimate no error and end so early that an estimate is needed
     words = (*words, "-ksp_norm_type", "preconditioned", "-ksp_rtol", "0.3")
     done = on_ranks(
         1, "-m", "msmpetsc.cli.main", "run", block_scene(folder, **SWINGS), *words, status=0

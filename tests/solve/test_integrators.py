@@ -16,15 +16,13 @@ SWING = {
 
 
 def bar(folder: Path, **tables) -> Path:
-    """Two cells, so that no mode is much faster than another: the motion is smooth at the steps
-    tried."""
+    """Return two cells without fast modes, so that the motion is smooth at the steps tried."""
     return block_scene(folder, np.array([0.25, 0.125, 0.125]), **SWING | tables)
 
 
 @pytest.fixture(scope="module")
 def exact(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
-    """By explicit substeps of which 60 make the shortest step tried: their own error is of second
-    order."""
+    """Return frames by explicit substeps, 60 to the shortest step; their error is of order 2."""
     time = {
         "step": DURATION / 8,
         "duration": DURATION,
@@ -41,7 +39,7 @@ ORDERS = [("implicit-euler", 1, (256, 512)), ("bdf2", 2, (128, 256)), ("verlet",
 def test_order_in_time(
     tmp_path: Path, exact: np.ndarray, integrator: str, order: int, parts: tuple[int, int]
 ):
-    """The slope of the error over the time step."""
+    """The order is the slope of the error over the time step."""
     errors = []
     for part in parts:
         extra = {"substep": DURATION / part} if integrator == "verlet" else {}
@@ -55,8 +53,8 @@ def test_order_in_time(
 def test_energy_left_of_one_mode(tmp_path: Path, integrator: str, steps: int):
     """A mode of frequency w without spin loses energy as the roots of the scheme say.
 
-    Implicit Euler loses 1 / (1 + w^2 t^2) a step. The mode is a cell that grows evenly. Its springs
-    act in phase at small strain; w^2 follows from the run's elastic energy 1/2 w^2 sum m |u|^2.
+    Implicit Euler loses 1 / (1 + w^2 t^2) per step. The mode is a cell that grows evenly. Its
+    springs act in phase at small strain. The run's elastic energy 1/2 w^2 sum m |u|^2 gives w^2.
     """
     small = 1e-5
     scene = block_scene(

@@ -1,7 +1,7 @@
 """A step ends at a minimum, not at a saddle, and as near as it reports.
 
-Rounding counts as an error. The cases once reported an error of at most 1e-3 that was 0.4 to 1. A
-random sample of hard scenes follows.
+Rounding counts as an error. In these cases steps once reported at most 1e-3 for errors of 0.4 to 1.
+A random sample of hard scenes follows.
 """
 
 import json
@@ -63,7 +63,7 @@ def write_case(folder: Path, name: str, **solver) -> Path:
 
 
 def play(path: Path, *overrides: str) -> list[Frame]:
-    """The frames, true errors measured, until the end or a step that fails."""
+    """Return the frames until the end or until a step fails, with true errors measured."""
     frames = []
     with loop_of(path, *overrides, true_error=1) as simulation, suppress(StepFailed):
         frames.extend(simulation.frames())
@@ -89,10 +89,7 @@ def test_a_symmetric_start_ends_at_a_minimum_or_says_that_it_does_not(
 
 
 def test_a_budget_that_ends_where_no_minimum_is_near_says_so(tmp_path: Path):
-    """A published iteration leaves the crushed beam flat.
-
-    No bound on its distance from the end exists.
-    """
+    """A single iteration leaves the crushed beam flat, so no bound on the error exists."""
     (frame,) = play(
         write_case(tmp_path, "crushed", preset="newton", max_iterations=1),
         "solver={preset='newton', max_iterations=1}",
@@ -110,9 +107,9 @@ def squashed(tmp_path: Path, share: float) -> tuple[Stepper, np.ndarray]:
 def test_the_lowest_curvature_is_that_of_a_dense_matrix(
     tmp_path: Path, petsc_options, share: float, multigrid: bool
 ):
-    """The lowest curvature of a squashed free beam, whose modes include its rigid motions.
+    """The search without a known mode finds the lowest curvature of a squashed free beam.
 
-    The search has no known mode.
+    The modes include the rigid motions of the beam.
     """
     petsc_options(pc_type="mg" if multigrid else "jacobi")
     simulation, q = squashed(tmp_path, share)
@@ -152,11 +149,10 @@ def dense_hessian(stepper: Stepper) -> np.ndarray:
 @pytest.mark.parametrize("preset", ["newton", "anderson", "fast-msm"])
 @pytest.mark.parametrize("shift", [0.0, 0.1], ids=["exactly", "by rounding"])
 def test_a_compressed_body_that_nothing_moves_is_at_rest(preset: str, shift: float):
-    """Its error is 0 / 0, or rounding over 0.
+    """A compressed body at rest has an error of 0 / 0, or rounding over 0, which counts as small.
 
-    Let c = k (r - 1) be the push across each spring. Spring by spring the bound of M^(-1) H is 1 -
-    4 t^2 c / m. It is negative here and calls for a search. The lowest eigenvalue is 1 - 3 t^2 c /
-    m.
+    Let c = k (r - 1) be the push in each spring. The bound of M^(-1) H by single springs is 1 - 4
+    t^2 c / m. It is negative here, so a search is needed. The lowest eigenvalue is 1 - 3 t^2 c / m.
     """
     k, r = 2e3, 1.1
     lattice = chain(T**2 * k * (r - 1) / 0.29, k, r)
@@ -171,8 +167,7 @@ def test_a_compressed_body_that_nothing_moves_is_at_rest(preset: str, shift: flo
 
 
 def test_a_body_at_rest_is_not_far_off_its_solution(tmp_path: Path, caplog):
-    """Once only rounding moves it, by 1e-12 of its size, the estimate is as large as the motion, or
-    2.8 times that."""
+    """The body moves by rounding, 1e-12 of its size; the estimate is up to 2.8 times that."""
     path = blocks.block_scene(
         tmp_path, sides=blocks.CELL * np.array([16, 1, 1]),
         pin=[{"region": {"box": [[-1, -1, -1], [0.01, 1, 1]]}}],
@@ -188,7 +183,7 @@ def test_a_body_at_rest_is_not_far_off_its_solution(tmp_path: Path, caplog):
 
 
 def test_rounding_is_an_error_and_no_zero(tmp_path: Path):
-    """A goal below the precision of doubles ends with the error by rounding, not with 0."""
+    """A goal below double precision ends with the rounding error, not with 0."""
     for preset in ("newton", "anderson"):
         (frame,) = play(
             write_case(tmp_path, "crushed", preset=preset),
@@ -205,7 +200,7 @@ PART = "part=[{region={half_space={point=[0.0,0.0,0.0], normal=[1,0,0]}}, young_
 def test_parts_that_are_as_good_as_rigid_are_refused_at_once(
     tmp_path: Path, soft: float, stiff: float
 ):
-    """At 1e8 to 1 a squashed body ended after 3,000 iterations of newton, or did not end."""
+    """At a ratio of 1e8 a squashed body took 3,000 iterations of newton, or did not converge."""
     with pytest.raises(InputError, match="as good as rigid"):
         load_scene(
             write_case(tmp_path, "crushed"), [f"material.young_modulus={soft!r}", PART % stiff]
@@ -218,7 +213,7 @@ def error_study(*words: object) -> str:
 
 
 def shares_said(seed: int, number: int, *changes: str) -> list[float]:
-    """Return the reported over the true error of each step of a scene."""
+    """Return the reported error over the true error for each step of a scene."""
     more = [word for change in changes for word in ("--set", change)]
     printed = error_study("--seed", seed, "--only", number, *more)
     return [error / true for error, true in json.loads(printed)["steps"]]
@@ -226,7 +221,7 @@ def shares_said(seed: int, number: int, *changes: str) -> list[float]:
 
 @pytest.mark.parametrize(("seed", "kinds"), [(7, ["any"]), (8, ["rub", "far", "touch"])])
 def test_random_hard_scenes_say_no_less_than_a_third_of_their_error(seed: int, kinds: list[str]):
-    """A sample of the scenes of scripts/error_study.py, which takes 500."""
+    """In 12 scenes of scripts/error_study.py steps report at least a third of their error."""
     (last,) = (
         line
         for line in error_study("--scenes", 12, "--seed", seed, "--kinds", *kinds).splitlines()
@@ -245,9 +240,8 @@ def test_what_cg_has_left_is_no_bound_across_a_kink(
 ):
     """Friction and contact make F at the next iterate differ from CG's residual.
 
-    Errors of 0.3 and 1.6 were reported as 0.08 and 0.07: 0.27 and 0.04 of them. The report stays an
-    estimate. In a scene a body springs back from an eighth of its length. Its steps report from
-    0.47 of their errors on, by the path of 70 iterations. Without a look at F at x - y, 0.27.
+    Without a look at F at x - y, errors of 0.3 and 1.6 were reported as 0.08 and 0.07. In one scene
+    a body springs back from an eighth of its length, in 70 iterations.
     """
     said = shares_said(seed, number, 'solver.preset="newton-multigrid"', *changes)
     assert min(said) > 1 / 3
@@ -257,28 +251,30 @@ def test_what_cg_has_left_is_no_bound_across_a_kink(
 def test_an_error_is_no_less_than_what_its_estimate_does_not_know(
     seed: int, number: int, was: float
 ):
-    """Errors that the estimate could not see.
+    """Estimates must not miss contact or modes that CG has not seen.
 
-    A stiff block lands on a plane with friction (40, 54): nodes begin to touch within the missing
-    part of e, where g was not evaluated. A cell hangs by an edge (115): CG of few iterations has
-    nothing of its mode.
+    A stiff block lands on a plane with friction (40, 54). Nodes begin to touch within the missing
+    part of e, where g was not evaluated. A cell hangs by an edge (115): few iterations of CG
+    contain nothing of its mode.
 
-    was : the least share that was reported
+    was : the least reported share before
     """
     assert was < 1 / 3 < min(shares_said(seed, number, 'solver.preset="newton-multigrid"'))
 
 
 def test_a_mode_that_stiffens_hides_no_lower_one():
-    """A step said 0.13 of its error while the search for curvature followed the mode of the step
-    before (1.57, when the lowest was 0.29): on the way to its solution the Hessian had negative
-    curvatures."""
+    """The search for curvature must not only follow the mode of the step before.
+
+    That mode had 1.57 when the lowest had 0.29, and the step reported 0.13 of its error. On the way
+    to the solution the Hessian had negative curvatures.
+    """
     said = shares_said(28, 11, 'solver.preset="newton-projected"')
     # 0.98 with PETSc 3.18, 0.896 with 3.22
     assert len(said) == 3 and min(said) > 0.85
 
 
 def test_a_preconditioner_far_from_the_hessian_bounds_no_error(tmp_path: Path):
-    """A ball that a step of fast spin has folded.
+    """A step of fast spin has folded a ball, and the bound by P^(-1) fails.
 
     CG had found 0.008 as the least eigenvalue of P^(-1) H. The residual of a solve of nine
     iterations was 22 times its bound, so 0.18 of the error was reported.

@@ -1,6 +1,6 @@
 """Natural frequencies against dense eigenvalues and closed forms of bars, on any number of ranks.
 
-Published values are those of scripts/yardstick.py.
+scripts/yardstick.py compares published values.
 """
 
 import json
@@ -47,7 +47,7 @@ def modes(path: Path, count: int) -> Modes:
 
 
 def dense_frequencies(path: Path, q: np.ndarray) -> np.ndarray:
-    """All frequencies [Hz] about positions q (n, 3), by a dense eigensolver."""
+    """Return all frequencies [Hz] about positions q (n, 3), by a dense eigensolver."""
     lattice = model_of(path).lattice
     free = ~lattice.fixed.ravel()
     stiffness = dense_hessian(Elasticity(lattice), q)[np.ix_(free, free)]
@@ -57,7 +57,7 @@ def dense_frequencies(path: Path, q: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("law", ["neo-hookean", "linear"])
 def test_modes_at_rest_are_those_of_dense_matrices(tmp_path: Path, law: str):
-    """A block whose cells the surface cuts, free and clamped."""
+    """The block's surface cuts cells; it is free or clamped."""
     material = {"young_modulus": YOUNG, "density": DENSITY, "law": law}
     for tables in ({}, {"pin": CLAMP}):
         path = body(tmp_path, [0.5, 0.31, 0.2], 0.11, material=material, **tables)
@@ -74,10 +74,10 @@ def test_modes_at_rest_are_those_of_dense_matrices(tmp_path: Path, law: str):
 def test_a_bar_on_rollers_keeps_the_rigid_motions_they_leave(
     tmp_path: Path, fix: str, ends: list, rigid: int
 ):
-    """Rollers at an end along the bar, or across the bar at both ends.
+    """Rollers hold an end along the bar, or both ends across the bar.
 
-    The bar moves along y and z and turns about x. It is half of a free bar of 2 m, whose
-    longitudinal modes are exact. Across, it slides along x.
+    With the first the bar moves along y and z and turns about x. It is half of a free bar of 2 m,
+    whose longitudinal modes are exact. With the second it slides along x.
     """
     pins = [pin | {"fix": list(fix)} for pin in ends]
     path = body(tmp_path, [1, 0.25, 0.25], 0.125, pin=pins)
@@ -91,7 +91,7 @@ def test_a_bar_on_rollers_keeps_the_rigid_motions_they_leave(
 
 
 def test_modes_of_a_loaded_body_are_those_of_its_state(tmp_path: Path):
-    """A sagging beam, by a static scene and from its file. Its modes differ from those at rest."""
+    """A sagging beam has the same modes from a static scene and from its file."""
     loaded = {"pin": CLAMP, "gravity": {"acceleration": [0, 0, -40.0]}}
     path = body(tmp_path, [1, 0.25, 0.25], 0.125, **loaded, time={"integrator": "static"})
     found = modes(path, 6).frequencies
@@ -108,8 +108,11 @@ def test_modes_of_a_loaded_body_are_those_of_its_state(tmp_path: Path):
 
 
 def test_an_obstacle_that_is_pressed_holds_the_tip(tmp_path: Path):
-    """A clamped bar's lowest bending has (1.875 / L)^2; with its far end supported (3.927 / L)^2,
-    which is 4.39 times as much, and more with the support before the end."""
+    """A support near the free end raises the lowest bending frequency of a clamped bar.
+
+    The values are (1.875 / L)^2 clamped and (3.927 / L)^2 supported at the end, which is 4.39 times
+    as much. A support before the end gives more.
+    """
     loaded = {"pin": CLAMP, "gravity": GRAVITY}
     loaded["time"] = {"integrator": "static"}
     plate = box_at([[0.9, -1, -0.5], [1.2, 1, -0.001]], response="penalty")
@@ -122,9 +125,9 @@ def test_an_obstacle_that_is_pressed_holds_the_tip(tmp_path: Path):
 
 
 def test_a_compressed_bar_grows_sideways_to_both_sides(tmp_path: Path):
-    """Shortened by 5%, beyond the first and short of the second buckling load.
+    """A bar shortened by 5% is beyond its first buckling load and short of its second.
 
-    Euler's load of two clamps, 4 pi^2 EI / L^2, has the strain pi^2 / 3 (t / L)^2 = 3.3%. The
+    Euler's load between two clamps, 4 pi^2 EI / L^2, has the strain pi^2 / 3 (t / L)^2 = 3.3%. The
     second load is 2.05 times as much.
     """
     shape = [1, 0.1, 0.1]
@@ -155,7 +158,7 @@ def test_shapes_are_orthonormal_and_two_bodies_have_twelve_rigid(tmp_path: Path)
 
 
 def test_ranks_agree_and_other_commands_read_the_shapes(tmp_path: Path):
-    """A square bar, whose modes come in pairs."""
+    """The modes of a square bar come in pairs."""
     path = body(tmp_path, [1, 0.1, 0.1], 1 / 40, 0.3, output={"surface": True})
     files, printed = [], []
     for ranks in (1, 3):

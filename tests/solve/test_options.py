@@ -87,7 +87,7 @@ LINES |= dict.fromkeys(
 
 @pytest.mark.parametrize("line", LINES)
 def test_an_options_file_is_looked_through_first(tmp_path: Path, line: str):
-    """Rank 0 alone reads the file, and the remaining ranks would wait for ever."""
+    """Only rank 0 reads the file; without this check the other ranks would wait for ever."""
     file = tmp_path / "options"
     file.write_text(f"-pc_type jacobi\n{line}\n")
     with nullcontext() if LINES[line] else pytest.raises(InputError, match="line 2"):
@@ -115,9 +115,9 @@ WITH_THE_SOLVERS = {
     "-ksp_rtol abc": "abc",
     "-snes_type nonsense": "loop and a line search of their own",
     "-pc_type nonsense": "nonsense",
-    # the dense block that was being worked on could not be destroyed
+    # the dense block in use could not be destroyed
     "-pc_type composite": "composite",
-    # the search for the lowest mode at rest applies it
+    # the search for the lowest mode at rest applies this preconditioner
     "--set time.integrator=static -pc_type composite": "composite",
     "--set time.integrator=static -pc_type shell": "apply",
     "--set time.integrator=verlet -ksp_type cg": "-ksp_type",
@@ -128,7 +128,7 @@ WITH_THE_SOLVERS = {
     MULTIGRID + "-mg_levels_pc_type nonsense": "nonsense",
     MULTIGRID + "-mg_levels_1_pc_type redistribute": "finest level",
 }
-# options of multigrid's cycle that go together, and the effect that shows
+# options of multigrid's cycle that go together, and words of their effect
 OBEYED = {
     "-pc_mg_levels 2 -mg_levels_ksp_max_it 2 -mg_coarse_pc_type cholesky "
     "-ksp_view": "MULTIPLICATIVE, levels=2",
@@ -144,7 +144,7 @@ OBEYED = {
     [*((1, options) for options in BEFORE_THE_MESH), (2, "-options_file gone")],
 )
 def test_it_is_told_before_the_mesh_is_read(tmp_path: Path, ranks: int, options: str):
-    """Which is not there."""
+    """The error comes before the mesh is read: the mesh is missing."""
     scene = block_scene(tmp_path, **SCENE, mesh={"source": "gone.ply"})
     before = sorted(tmp_path.iterdir())
     done = run(ranks, *COMMAND, scene, "-o", tmp_path / "o.h5", *options.split())
@@ -210,7 +210,7 @@ FRAMES = "import sys, msmpetsc; list(msmpetsc.frames(sys.argv[1], petsc_options=
 def test_a_process_ends_with_its_error_though_python_has_left_petsc_an_object(
     tmp_path: Path, options: str
 ):
-    """The traceback holds a PC of type python, which PETSc destroyed once Python was no more."""
+    """The traceback holds a PC of type python, which PETSc destroyed after Python had ended."""
     scene = block_scene(tmp_path, **SCENE)
     words = [*COMMAND, scene, "-o", tmp_path / "o.h5", *options.split()]
     done = python(*words, env=ENVIRONMENT | ALONE)
@@ -228,7 +228,7 @@ def test_an_option_that_no_object_has_is_told_before_the_last_frame(tmp_path: Pa
 
 
 def test_an_option_that_is_read_while_solving_is_awaited_until_something_is_solved(tmp_path: Path):
-    """A body at rest without loads solves nothing."""
+    """A body at rest without loads solves nothing, so the option stays unread without an error."""
     still = SCENE | {"gravity": {"acceleration": [0, 0, 0]}}
     run(1, *COMMAND, block_scene(tmp_path, **still), "-o", tmp_path / "o.h5", "-ksp_view", status=0)
     done = run(
@@ -267,7 +267,7 @@ def test_a_solver_that_ends_by_a_rule_of_its_own_is_told(petsc_options):
 
 
 def test_iterations_of_a_step_have_a_bound_that_no_option_lifts(petsc_options):
-    """Steps that are cut short to nothing go on as long as they may."""
+    """Steps so short that they make no progress go on up to the bound."""
     petsc_options(
         snes_type="newtonls", snes_linesearch_maxstep="1e-9", snes_max_it="100000", pc_type="jacobi"
     )
@@ -298,7 +298,7 @@ def test_a_load_beyond_all_numbers_is_told(tmp_path: Path, load: str):
 
 @pytest.mark.parametrize("preset", ["newton", "anderson", "lbfgs"])
 def test_the_reason_says_which_rule_ended_the_step(preset: str):
-    """A correction that is short enough, or |F| alone; or the budget."""
+    """The rules are a short correction, a small |F|, and the budget."""
     from petsc4py import PETSc
 
     reasons, seen = PETSc.SNES.ConvergedReason, set()

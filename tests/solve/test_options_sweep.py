@@ -1,8 +1,8 @@
-"""Each option that -help lists for the objects of a run, with values of wrong types, zero, negative
-and no numbers.
+"""Each option that -help lists is tried with wrong types, zero, negative values and no numbers.
 
-Each is tried in a fork of this process, which has carried out the scene: a fifth of a second, where
-a start takes two."""
+Each run is a fork of this process, which has run the scene before. A fork takes a fifth of a
+second, a start two seconds.
+"""
 
 import os
 import re
@@ -40,7 +40,7 @@ SCENES = {
         [],
     ),
 }
-# options that once ended in a crash, a traceback or no end
+# options that once ended in a crash, a traceback or a hang
 FAULTY = [
     "-ksp_max_it 0", "-ksp_max_it -1", "-pc_mg_levels 0", "-pc_type shell", "-pc_type composite",
     "-pc_type jacobbi", "-pc_type hypre -pc_hypre_type foo", "-pc_type gamg -pc_gamg_type foo",
@@ -72,8 +72,10 @@ def options_in(text: str) -> Iterator[tuple[str, str]]:
 
 
 def attempt(folder: Path, words: list[str]) -> tuple[int | None, str]:
-    """Return the status of a command in a fork, negative for a signal, None for no end; and all
-    that it says."""
+    """Return the status and all output of a command in a fork.
+
+    The status is negative for a signal, None for a hang.
+    """
     path = folder / "said"
     sys.stdout.flush()
     child = os.fork()
@@ -106,7 +108,7 @@ def attempt(folder: Path, words: list[str]) -> tuple[int | None, str]:
 
 
 def fault_of(status: int | None, said: str) -> str:
-    """Return why a user should not meet this end; an empty string for a good end."""
+    """Return why a user should not see this end; an empty string for a good end."""
     errors = [line for line in said.splitlines() if line.startswith("msmpetsc: error:")]
     if status not in (0, 2, 3) or len(errors) != (status != 0):
         return f"status {status}, {len(errors)} lines of error"
@@ -114,7 +116,7 @@ def fault_of(status: int | None, said: str) -> str:
 
 
 def faults_of(folder: Path, words: list[str], options: list[list[str]]) -> str:
-    """Return a paragraph for each of a command's options that ends as no user should meet it."""
+    """Return a paragraph for each of a command's options that ends as no user should see it."""
     start_for_runs(MPI.COMM_WORLD, [])
     assert main(words) == 0
     ends = [(option, *attempt(folder, [*words, *option])) for option in options]

@@ -1,4 +1,4 @@
-"""Small cases that are hard on a solver (scenes/studies/stability.toml), with their ends."""
+"""Small cases that are hard for a solver (scenes/studies/stability.toml), and their outcomes."""
 
 import tomllib
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ CASES = {
     for case in of.get("case", ())
     if case["file"].startswith("hard/")
 }
-# part of the names of cases with a neo-Hookean solid in place of springs
+# part of the names of cases with a neo-Hookean solid instead of springs
 SOLID = ", solid"
 SOLIDS = [
     name + SOLID
@@ -49,7 +49,7 @@ TOUCHING = {case["name"]: case for of in MAPS if of["name"] == "touching" for ca
 
 @dataclass(frozen=True)
 class Played:
-    """The frames until the end, or until a step failed: ``words`` then say how."""
+    """The frames of a run until its end, or until a step fails: ``words`` is the message."""
 
     scene: Scene
     model: Model
@@ -70,7 +70,7 @@ class Played:
 
     @property
     def moved(self) -> np.ndarray:
-        """(n, 3) in lengths of the body."""
+        """Displacements (n, 3) in lengths of the body."""
         return (self.last.position - self.lattice.nodes) / self.size
 
     def inverted(self, frame: Frame) -> int:
@@ -84,7 +84,7 @@ class Played:
 
 @cache
 def play(name: str, *changes: str) -> Played:
-    """A case, in this process; by newton, to 1e-3, if nothing else is said."""
+    """Run a case in this process, by default by newton to 1e-3."""
     case = CASES[name.removesuffix(SOLID)]
     law = ["material.law=neo-hookean"] if name.endswith(SOLID) else []
     path, changes = STUDIES / case["file"], [*case.get("set", ()), *law, *changes]
@@ -100,7 +100,7 @@ def play(name: str, *changes: str) -> Played:
     return Played(scene, model, frames, words)
 
 
-# ---- newton, the default, survives them all
+# ---- newton, the default, solves them all
 
 # each case takes ten seconds
 LONG = {"stiff half, twisted", "pressed flat, solid"}
@@ -145,7 +145,7 @@ BACK = {
     "name", [pytest.param(name, marks=[pytest.mark.slow] * (name in LONG)) for name in BACK]
 )
 def test_it_comes_back_to_its_rest_shape(name: str):
-    """Somewhere in space, within a part of its length; no cell stays inverted."""
+    """The body has its rest shape up to a rigid motion; no cell stays inverted."""
     played = play(name)
     assert played.shape_error() < BACK[name]
     assert played.inverted(played.last) == 0
@@ -153,16 +153,16 @@ def test_it_comes_back_to_its_rest_shape(name: str):
 
 
 def test_a_micrometre_of_rubber_comes_back():
-    """In these units PETSc takes a climbing path of CG for a minimum.
+    """A micrometre of rubber comes back, since the projected Hessian takes over.
 
-    The projected Hessian takes over.
+    In these units PETSc takes a rising direction of CG for a converged solution.
     """
     played = play("tiny", "material.law=neo-hookean", "material.poisson_ratio=0.49")
     assert not played.words and played.shape_error() < 1e-4
 
 
 def test_a_nearly_flat_body_comes_back_to_its_rest_shape_or_the_mirror_image():
-    """Both are as near."""
+    """Both shapes are equally near."""
     played = play("nearly flat")
     assert min(played.shape_error(), played.shape_error(mirror=(-1, 1, 1))) < 1e-6
     assert played.last.elastic < 1e-6 * max(frame.elastic for frame in played.frames)
@@ -185,22 +185,24 @@ def test_it_hangs_at_rest(name: str):
 
 @pytest.mark.parametrize("name", ["column", "column, solid"])
 def test_a_column_bows_aside(name: str):
-    """The middle moves aside by w, by itself.
+    """The middle of the column moves aside by w without a sideways load.
 
-    If the length were kept, it would be pi^2 w^2 / 4 L. Springs alone twist at the fold, too. That
-    is 15% lower in energy than the earlier hinge in a plane, with w = 0.20.
+    With constant length w would follow from pi^2 w^2 / 4 L. Only springs also twist at the fold,
+    which has 15% less energy than a hinge in a plane with w = 0.20.
     """
     played = play(name)
     middle = np.abs(played.lattice.nodes[:, 0] - 0.5) < 0.01
     assert 0.15 < np.linalg.norm(played.moved[middle].mean(axis=0)[1:]) < 0.41
-    # Springs fold into a hinge. Corners of a solid's cells may, their mean strain does
-    # not.
+    # Springs fold into a hinge. The corners of a solid's cells may fold, but the mean
+    # strain does not.
     assert (played.last.inverted == 0) == name.endswith(SOLID)
 
 
 def test_parts_of_the_greatest_contrast_are_solved():
-    """A clamped beam squashed to 0.62, half of it 1e6 times as stiff: at 1e8, now refused, a step
-    did not end."""
+    """A clamped beam is squashed to 0.62, and half of it is 1e6 times as stiff.
+
+    At 1e8, which is refused, a step did not converge.
+    """
     played = play(
         "stiff half", "start.scale=[0.62, 0.62, 0.62]", "cages.cell_size=0.125", "time.duration=0.5"
     )
@@ -219,7 +221,7 @@ def test_parts_of_the_greatest_contrast_are_solved():
 
 
 def test_a_flat_body_leaves_its_plane():
-    """No spring pulls out of it, but in it a step is at a saddle."""
+    """No spring force leads out of the plane, but a step in the plane ends at a saddle."""
     played = play("flat")
     assert np.ptp(played.last.position[:, 2]) > 0.1 * np.ptp(played.lattice.nodes[:, 2])
     assert played.last.elastic < 0.6 * played.frames[0].elastic
@@ -236,8 +238,7 @@ def test_a_mirrored_body_stays_mirrored():
 
 
 def test_cells_that_went_through_each_other_stay_so_under_hookes_law(petsc_options):
-    """At rest, without a spring strained much, some cells inside out. As a solid the body comes
-    back."""
+    """Some cells stay inside out, at rest and with little strain; a solid comes back."""
     petsc_options(pc_type="jacobi")
     played = play.__wrapped__("pressed")
     assert 0 < played.inverted(played.last) < len(played.lattice.cells)
@@ -254,9 +255,9 @@ def test_faces_led_through_each_other_leave_a_body_turned_over():
 
 
 def test_springs_pass_through_no_length_exactly():
-    """The 9 x 17 upright springs in the half that is led.
+    """The 9 x 17 upright springs of the half that an anchor moves pass through zero length.
 
-    When it is let go, the half is turned over, except for a crease.
+    After its release, the half is turned over, except for a crease.
     """
     played = play("through, sheet")
     lattice, flat = played.lattice, played.frames[8].position
@@ -295,13 +296,13 @@ COMES_BACK = [
 # DIVERGED_FNORM_NAN, which PETSc 3.25 renames
 NOT_FINITE = REASON[-4]
 DIVERGES = [
-    # A is no less than the Hessian of springs, but far from it where all are pressed:
-    # steps are small, or too long
+    # A bounds the Hessian of springs, but is far from it if all springs are pressed:
+    # steps are too small or too long
     ("anderson", "flat", "DIVERGED_MAX_IT after 300 iterations"),
     ("fast-msm", "column", "DIVERGED_MAX_IT after 1000 iterations"),
     ("anderson", "column, solid", "DIVERGED_MAX_IT after 300 iterations"),
-    # A is of the solid at rest, and no line search holds the steps of cells that are
-    # inside out back
+    # A belongs to the solid at rest, and no line search limits steps of cells that are
+    # inside out
     ("anderson", "mirrored, solid", "DIVERGED_"),
     ("fast-msm", "mirrored, solid", NOT_FINITE),
 ]
@@ -316,7 +317,7 @@ def test_other_presets_bring_it_back_too(method: str, name: str):
 
 @pytest.mark.parametrize(("method", "name", "words"), DIVERGES)
 def test_other_presets_fail_and_say_so(method: str, name: str, words: str):
-    """In a line, with the frame and a remedy."""
+    """The message is one line with the frame and a remedy."""
     told = play(name, *OTHERS[method]).words
     assert (
         told.startswith("frame ")
@@ -334,13 +335,12 @@ RESCUED = [
 
 @pytest.mark.parametrize(("how", "changes"), RESCUED)
 def test_what_anderson_cannot_do_is_rescued(how: str, changes: list[str]):
-    """Inertia holds nodes where they are in shorter steps; newton-projected sees the Hessian of
-    cells inside out."""
+    """Shorter steps hold nodes by inertia; newton-projected has the Hessian of inverted cells."""
     name, anderson = "mirrored, solid", [*OTHERS["anderson"], *changes]
     assert "DIVERGED" in play(name, *anderson).words
     played = play(name, *anderson, f"safety.on_failure={how}")
-    # It still swings, by 2e-7 to 1.2e-3 with different roundings; a folded body is 0.1
-    # off
+    # It still oscillates, by 2e-7 to 1.2e-3 with different roundings; a folded body
+    # would be 0.1 off
     assert not played.words and played.shape_error() < 5e-3
     assert played.inverted(played.last) == 0
     rescued = [getattr(frame, f"{how}s") for frame in played.frames]
@@ -349,7 +349,7 @@ def test_what_anderson_cannot_do_is_rescued(how: str, changes: list[str]):
 
 
 def test_a_checkpoint_of_a_rescued_run_goes_on_where_nothing_is_rescued(tmp_path):
-    """--force takes another safety.on_failure: there its halvings and its tally mean nothing."""
+    """With another safety.on_failure the halvings and counts of the checkpoint mean nothing."""
     path = block_scene(tmp_path, time={"step": 0.01, "duration": 0.02}, gravity=GRAVITY)
     with loop_of(path) as simulation:
         saved = simulation.saved

@@ -38,14 +38,14 @@ def column(folder: Path, time: dict = STATE, **tables) -> Path:
 
 
 def moved(model, frame) -> np.ndarray:
-    """Mean displacement (3,) [m] of the top."""
+    """Return the mean displacement (3,) [m] of the top."""
     top = model.lattice.nodes[:, 2] > COLUMN[2] - 0.01
     return (frame.position - model.lattice.nodes)[top].mean(axis=0)
 
 
 @pytest.mark.parametrize("preset", ["newton", "newton-multigrid", "lbfgs", "fast-msm"])
 def test_a_mass_hangs_on_a_spring(preset: str):
-    """x = r + m g / k: M, which would hold it back, has no part."""
+    """The mass hangs at r + m g / k; M has no influence."""
     m, k, r = 2.0, 300.0, 0.5
     stepper = Stepper(COMM, one_spring(m, k, r), 0.3, find_preset(preset), 1e-9, static=True)
     stepper.set_up()
@@ -57,7 +57,7 @@ def test_a_mass_hangs_on_a_spring(preset: str):
 
 
 def test_states_under_forces_that_come_and_go(tmp_path: Path):
-    """A state for each time. States under the same loads are the same and cost nothing."""
+    """Each time has its state. States under the same loads are equal and take no iteration."""
     states = {"step": 1.0, "duration": 6.0, "integrator": "static"}
     model, frames = play(column(tmp_path, states, pin=[{"region": BOTTOM}], force=SWITCHED))
     there, back, rest = (moved(model, frames[n]) for n in (1, 3, 5))
@@ -78,7 +78,7 @@ def test_anchors_lead_from_state_to_state_and_let_go(tmp_path: Path):
 
 
 def test_an_obstacle_presses(tmp_path: Path):
-    """k d of all nodes that it holds is the weight, where the body is but guided from the side."""
+    """The obstacle's forces k d sum to the force of a column that is only guided at the top."""
     plane = plane_at(0.01, response="penalty", stiffness=1e3)
     guide = [{"region": TOP, "path": [{"time": 1.0, "by": [0.0, 0.0, 0.0]}]}]
     model, frames = play(column(tmp_path, anchor=guide, obstacle=[plane]))
@@ -119,8 +119,10 @@ def test_what_only_motion_has_is_refused(tmp_path: Path, words: str):
 @pytest.mark.parametrize("sideways", [0.0, 1e-3])
 @pytest.mark.parametrize("share, buckles", [(0.8, False), (2.0, True)])
 def test_a_column_buckles(tmp_path: Path, sideways: float, share: float, buckles: bool):
-    """Under more than Euler's load (its own bending is stiffer by 169/140 (h/b)^2) it is no longer
-    straight, even where nothing pushes it aside: the straight state is a saddle."""
+    """Beyond Euler's load the column leaves its straight state, also without a side force.
+
+    That state is a saddle. Its own bending is stiffer by 169/140 (h/b)^2.
+    """
     force = [{"region": TOP, "total": [sideways * EULER, 0.0, -share * EULER]}]
     model, frames = play(column(tmp_path, pin=[{"region": BOTTOM}], force=force))
     aside = np.hypot(*moved(model, frames[-1])[:2])
@@ -131,7 +133,7 @@ def test_a_column_buckles(tmp_path: Path, sideways: float, share: float, buckles
 def test_a_load_comes_on_in_steps_and_ends_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Applied at once or in load steps, the load has the same equilibrium."""
+    """Applied at once or in load steps, the load leads to the same equilibrium."""
     _, at_once = play(column(tmp_path, **BEAM))
     monkeypatch.setattr(static, "Halving", lambda: Halving(3))
     _, in_parts = play(column(tmp_path, **BEAM))
@@ -157,8 +159,7 @@ def test_shares_of_a_load():
 def test_a_state_that_fails_is_found_another_way(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, on_failure: str
 ):
-    """By the robust preset, or by way of states at times between, which are states, too: anchors go
-    there in parts."""
+    """The fallback preset finds the state, or substeps do, in which anchors move by parts."""
     anchor = [{"region": TOP, "path": [{"time": 1.0, "by": [0.0, 0.05, 0.0]}]}]
     tables = {"pin": [{"region": BOTTOM}], "anchor": anchor}
     _, usual = play(column(tmp_path, **tables))

@@ -1,4 +1,4 @@
-"""A single step: against closed forms, against dense linear algebra, and preset against preset."""
+"""A single step against closed forms, dense linear algebra, and other presets."""
 
 import gc
 from dataclasses import replace
@@ -19,7 +19,7 @@ from msmpetsc.solve.presets import PRESETS, find_preset
 
 
 def residual(lattice: Lattice, x: np.ndarray, q: np.ndarray, before: np.ndarray) -> np.ndarray:
-    """F(x) by numpy alone, at the free nodes."""
+    """Return F(x) by numpy alone, at the free nodes."""
     ends = x[lattice.springs]
     along = ends[:, 0] - ends[:, 1]
     length = np.linalg.norm(along, axis=1)
@@ -38,8 +38,10 @@ def reference() -> list:
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_free_fall_is_the_schemes_own(preset: str):
-    """q_n = q_0 + g t^2 n (n + 1) / 2: implicit Euler from rest, to the KSP's tolerance for
-    ``paper``."""
+    """Implicit Euler from rest gives q_n = q_0 + g t^2 n (n + 1) / 2.
+
+    With ``paper`` this holds to the tolerance of the KSP.
+    """
     lattice = build_lattice(
         cages_of(block(3, 2, 2), 0.1), Material(density=1000, young_modulus=2e5, law="linear")
     )
@@ -60,8 +62,7 @@ def test_newton_solves_the_step_to_rounding(reference: list):
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_one_mass_on_a_spring_follows_its_recurrence(preset: str):
-    """Along a spring of length r the scheme is linear: (m + t^2 k) x = m (2 q_n - q_(n-1)) + t^2 k
-    r."""
+    """Along the spring the scheme is linear: (m + t^2 k) x = m (2 q_n - q_(n-1)) + t^2 k r."""
     m, k, r = 0.3, 40.0, 1.0
     lattice = one_spring(m, k, r)
     stepper = Stepper(COMM, lattice, T, find_preset(preset), error=1e-7)
@@ -111,7 +112,7 @@ def test_too_loose_a_solve_is_told():
 
 def test_published_presets_take_ten_iterations_and_say_their_error():
     for result in swing("fast-msm", 3):
-        # each iteration is one solve; the rest is CG that estimates the error
+        # each iteration is one solve; the other iterations of CG estimate the error
         assert (
             result.cost.iterations == 10
             and 10 < result.cost.ksp_its <= 20
@@ -154,8 +155,7 @@ def test_another_type_goes_with_a_preset(petsc_options, preset: str, options: di
 
 
 def test_a_fault_of_ours_within_petsc_is_no_bad_option():
-    """PETSc 3.18 lets the exception of a callback through, 3.26 makes it the cause of its own
-    error."""
+    """PETSc 3.18 passes a callback's exception on, 3.26 makes it the cause of its own error."""
     from petsc4py import PETSc
 
     def fault(*_):
@@ -186,8 +186,7 @@ def test_a_preset_leaves_no_options_behind():
 
 
 def test_A_is_M_plus_t2_L():
-    """Against a dense sum over springs: symmetric, positive definite, its rows sum to the mass
-    without pins."""
+    """A equals a dense sum over springs. Without pins its rows sum to the mass."""
     lattice = build_lattice(
         cages_of(block(2, 2, 1), 0.1), Material(density=1000, young_modulus=2e5, law="linear")
     )
@@ -204,8 +203,7 @@ def test_A_is_M_plus_t2_L():
 
 
 def test_a_plain_iteration_is_the_papers_global_step():
-    """x <- x - A^(-1) F(x) from y is (M + t^2 L)^(-1) (t^2 J d + M y + t^2 f_ext) (Eq. 17), dense
-    here."""
+    """x - A^(-1) F(x) at y is (M + t^2 L)^(-1) (t^2 J d + M y + t^2 f_ext), Eq. 17."""
     lattice = build_lattice(
         cages_of(block(2, 2, 1), 0.1), Material(density=1000, young_modulus=2e5, law="linear")
     )
@@ -226,9 +224,10 @@ def test_a_plain_iteration_is_the_papers_global_step():
 
 
 def test_a_strut_that_buckles_under_its_load():
-    """A spring pressed to half by a load in balance with it: the only force left is across, with
-    negative curvature, and CG goes up. It must come to F = 0 all the same (which may be a
-    saddle)."""
+    """A spring pressed to half is in balance with its load, so CG meets negative curvature across.
+
+    The step must still reach F = 0, which may be a saddle.
+    """
     m, k, r, length = 0.3, 4000.0, 1.0, 0.5
     lattice = one_spring(m, k, r)
     load = np.array([[0.0, 0, 0], [0, 0, -k * (r - length)]])
@@ -243,7 +242,7 @@ def test_a_strut_that_buckles_under_its_load():
 
 
 def test_a_body_pressed_to_half_still_gives_a_descent():
-    """Springs under compression make the true Hessian indefinite; newton must come through."""
+    """Springs under compression make the true Hessian indefinite; newton must still lower g."""
     lattice = build_lattice(
         cages_of(block(4, 3, 3), 0.1), Material(density=1000, young_modulus=2e6, law="linear")
     )
@@ -257,7 +256,7 @@ def test_a_body_pressed_to_half_still_gives_a_descent():
     Elasticity(lattice).add_gradient(x, g)
     F = lattice.mass[:, None] * (x - pressed) + T**2 * (g - weight(lattice))
     away = np.sqrt(((x - pressed) ** 2).sum(axis=1) @ lattice.mass)
-    # the bound on the error, which was to be 1e-6: it may be too large by the root of H
+    # bound on the error, for a target of 1e-6: it may be too large by the root of H
     # over M, 20 here
     assert np.sqrt((F**2).sum(axis=1) @ (1 / lattice.mass)) <= 20 * 1e-6 * away
     energy = Elasticity(lattice).energy

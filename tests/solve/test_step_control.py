@@ -1,5 +1,4 @@
-"""The choice of steps by an account of their errors, without a body; and the times that steps may
-start and end at."""
+"""The choice of steps by an account of their errors, without a body; and their allowed times."""
 
 from collections.abc import Callable
 
@@ -17,8 +16,10 @@ def control(order: int, error: float, levels: tuple[int, int] = LEVELS) -> StepC
 def march(
     control: StepControl, rate: Callable[[float], float], until: float = 1.0
 ) -> list[tuple[float, int]]:
-    """Start and level of each step of a motion of size 1; local errors are t^(order + 1) times the
-    greater rate at their ends."""
+    """Return start and level of each step of a motion of size 1.
+
+    Local errors are t^(order + 1) times the greater rate at the ends of a step.
+    """
     ticks, tick, taken = Ticks(STEP, STEPS, LEVELS[0], []), 0, []
     while tick < until * ticks.ticks:
         level, start = ticks.fitting(tick, control.level), ticks.time(tick)
@@ -32,7 +33,7 @@ def march(
 
 
 def test_what_an_even_flight_saves_is_spent_on_the_impact_after_it():
-    """Steps of the impact are longer than in a run that is all impact."""
+    """After an even flight, steps of the impact are longer than in a run that is all impact."""
 
     def rate(time: float) -> float:
         return 100.0 if 1.9 < time < 2.5 else 1e-6
@@ -46,7 +47,7 @@ def test_what_an_even_flight_saves_is_spent_on_the_impact_after_it():
 
 
 def test_no_moment_takes_all_the_steps():
-    """A moment a million times as hard takes at most twenty times the steps of the rest."""
+    """A moment of 1e6 times the rate takes at most twenty times the steps of the rest."""
     account = control(2, 1e-2)
     levels = march(account, lambda time: 1e6 if 2.0 <= time <= 2.1 else 1.0)
     assert len(levels) < 20 * len(march(control(2, 1e-2), lambda _: 1.0))

@@ -1,5 +1,4 @@
-"""The explicit integrator: against the leapfrog's closed forms, numpy's eigenvalues, Coulomb's
-law."""
+"""The explicit integrator against closed forms, numpy's eigenvalues and Coulomb's law."""
 
 from pathlib import Path
 
@@ -38,7 +37,7 @@ def integrator(lattice: Lattice, substep: float | None = None) -> Verlet:
 def fly(
     lattice: Lattice, q: np.ndarray, v: np.ndarray, steps: int, substep: float | None = None
 ) -> list[State]:
-    """States of a body that nothing acts on, at the start and after each step."""
+    """Return the states of a body without loads, at the start and after each step."""
     stepper, states = integrator(lattice, substep), [State(q, q - T * v)]
     try:
         for index in range(1, steps + 1):
@@ -53,7 +52,7 @@ def velocity(state: State) -> np.ndarray:
 
 
 def cube(law: str = "linear") -> Lattice:
-    """2 x 2 x 2 cells of 0.1 m."""
+    """Return a lattice of 2 x 2 x 2 cells of 0.1 m."""
     return build_lattice(
         cages_of(block(2, 2, 2), 0.1), Material(density=1000, young_modulus=2e4, law=law)
     )
@@ -67,7 +66,7 @@ def shaken(lattice: Lattice, size: float) -> np.ndarray:
 
 
 def test_one_mass_on_a_spring_follows_the_leapfrogs_own_dispersion():
-    """The dispersion of the leapfrog itself.
+    """The frequency has the dispersion of the leapfrog.
 
     x_n = cos(w n dt) and v_n = -sin(w dt) / dt sin(w n dt), with w = 2 / dt asin(omega dt / 2).
     Here omega^2 = k / m.
@@ -85,7 +84,7 @@ def test_one_mass_on_a_spring_follows_the_leapfrogs_own_dispersion():
 def test_free_flight_keeps_momentum_and_angular_momentum():
     """The forces are central, and a kick changes v at constant q.
 
-    So the leapfrog keeps r x m v, which implicit Euler does not.
+    So the leapfrog keeps r x m v, unlike implicit Euler.
     """
     lattice = cube()
     v = np.cross([0, 2, 9], lattice.nodes) + np.random.default_rng(1).normal(
@@ -119,8 +118,7 @@ VERLET = 'time.integrator="verlet"'
 
 def test_the_energy_of_a_swinging_beam_stays_where_implicit_euler_loses_it(tmp_path: Path):
     def lost(frames: list[Frame]) -> tuple[float, float]:
-        """How far the energy is from the start's at the end and at most, of the greatest kinetic
-        energy."""
+        """Return the final and the greatest change of energy, over the greatest kinetic energy."""
         total = np.array([f.kinetic + f.elastic + f.potential for f in frames])
         away = np.abs(total - total[0]) / max(f.kinetic for f in frames)
         return away[-1], away.max()
@@ -130,8 +128,8 @@ def test_the_energy_of_a_swinging_beam_stays_where_implicit_euler_loses_it(tmp_p
     _, fine = swing(tmp_path, T, 4.0, VERLET, "time.substep=1e-3")
     _, implicit = swing(tmp_path, T, 0.5)
     assert lost(implicit)[0] > 0.2
-    # at the limit, which the springs that the clamp cuts set, 6%; of 70 times shorter
-    # squares the 40th part or less
+    # 6% at the stability limit, which springs cut by the clamp determine; substeps with
+    # a 70th of the square have at most a 40th of that
     assert lost(explicit)[1] < 0.07 and lost(fine)[1] < 0.07 / 40
     late = [f.kinetic for f in explicit if f.time > 3]
     # the oscillation continues
@@ -179,7 +177,7 @@ def test_a_substep_beyond_the_limit_is_shortened_and_a_shorter_one_kept(tmp_path
 
 @pytest.mark.parametrize("response", ["reflect", "penalty"])
 def test_a_blow_that_stiffens_the_body_is_taken_in_shorter_substeps(tmp_path: Path, response: str):
-    """A soft block, thrown down: omega at the impact is more than twice that of the flight."""
+    """omega at the impact of a soft block is more than twice that of the flight."""
     floor = plane_at(-0.05, response=response)
     material = solid_of(1e4)
     time = {"step": T, "duration": 0.4} | EXPLICIT
@@ -196,10 +194,10 @@ def test_a_blow_that_stiffens_the_body_is_taken_in_shorter_substeps(tmp_path: Pa
 
 
 def test_a_body_that_folds_is_not_heated(tmp_path: Path, monkeypatch):
-    """A soft beam that is stretched and let go folds over itself.
+    """A soft beam that is stretched and released folds over itself.
 
-    Springs of nearly no length turn about in a substep at the limit. The beam gained 43% of its
-    energy in a step of 0.1 s.
+    Springs of nearly zero length turn round within a substep at the stability limit. The beam once
+    gained 43% of its energy in a step of 0.1 s.
     """
     scene = block_scene(
         tmp_path, sides=CELL * np.array([8, 2, 2]), time={"step": 0.1, "duration": 1.0} | EXPLICIT,
@@ -240,8 +238,7 @@ def test_nodes_that_are_led_keep_to_their_path_and_are_let_go_with_its_speed(tmp
 
 @pytest.mark.parametrize("stop", [6.0, 6.5])
 def test_the_work_of_an_anchor_that_lets_go_is_no_energy_from_nowhere(tmp_path: Path, stop: float):
-    """It turns round half a step before it lets go within a step, and the nodes keep the speed that
-    this gave them."""
+    """The anchor turns half a step before it lets go, and nodes keep the speed of the turn."""
     top = {"box": [[-1, -1, 0.2], [1, 1, 1]]}
     path = [
         {"time": time * T, "by": [0, 0, 0.03 * height]} for time, height in ((6.25, 1), (12, 6))
@@ -258,14 +255,14 @@ TILT = 0.3
 
 
 def on_a_slope(folder: Path, friction: float, **time) -> Path:
-    """A block on a plane, with gravity tilted."""
+    """Write the scene of a block on a plane, with tilted gravity."""
     floor = plane_at(response="penalty", friction=friction)
     gravity = {"acceleration": [G * np.sin(TILT), 0, -G * np.cos(TILT)]}
     return block_scene(folder, gravity=gravity, obstacle=[floor], time=time)
 
 
 def settled(folder: Path, friction: float) -> tuple[Path, State]:
-    """At rest on the slope, by implicit Euler, which damps."""
+    """Return the scene and the state at rest on the slope, found by implicit Euler, which damps."""
     scene = on_a_slope(folder, friction, step=0.1, duration=5.0)
     q = play(scene, "solver.error=1e-6", "output.every=1000")[1][-1].position
     return scene, State(q, q)
@@ -278,16 +275,17 @@ def go_on(scene: Path, state: State, steps: int) -> tuple[Model, list[Frame]]:
 
 
 def test_a_block_sticks_to_a_slope_below_the_angle_of_friction(tmp_path: Path):
-    """Not a creep: half a second at rest, though the substep is no smaller than without
-    friction."""
+    """The block rests half a second without creep; substeps are as long as without friction."""
     scene, state = settled(tmp_path, 2 * np.tan(TILT))
     _, frames = go_on(scene, state, 30)
     assert np.abs(frames[-1].position - state.q).max() < 1e-7
 
 
 def test_a_block_slides_down_a_slope_by_coulombs_law(tmp_path: Path):
-    """p_x = m g sin t - mu (p_z + m g cos t), whatever the push does in between: it is p_z + m g
-    cos t in all."""
+    """p_x = m g sin t - mu (p_z + m g cos t), for any course of the push.
+
+    The total push is p_z + m g cos t.
+    """
     mu, start = 0.5 * np.tan(TILT), settled(tmp_path, 0.5 * np.tan(TILT))[1]
     scene = on_a_slope(tmp_path, mu, step=T, duration=1.0)
     model, frames = go_on(scene, State(start.q, start.q), 30)

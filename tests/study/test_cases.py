@@ -129,9 +129,9 @@ def test_a_case_is_its_scene_its_mesh_and_its_options(tmp_path: Path):
 
 
 def test_a_reference_of_its_own_cells_is_one_for_all_lattices(tmp_path: Path):
-    """The reference has neither a case's cells nor the sweep's changes.
+    """A reference with its own cells has neither a case's cells nor the sweep's changes.
 
-    Surfaces are stored for comparison.
+    Its runs store surfaces, which are compared.
     """
     reference = 'reference = { cells = 5000, integrator = "bdf2", step = 0.005 }\n'
     sweep = '[[sweep]]\ncells = [10, 80]\n[[sweep]]\ncells = [10]\nset = ["cages.boundary=whole"]'
@@ -155,7 +155,7 @@ def test_a_reference_of_its_own_cells_is_one_for_all_lattices(tmp_path: Path):
 
 
 def test_a_law_is_that_of_the_reference_too(tmp_path: Path):
-    """Each law has a reference of its own, unless the scene names the law of a common reference."""
+    """Each law has its own reference, unless the scene names the law of a common reference."""
     reference = 'reference = { cells = 5000, integrator = "bdf2", step = 0.005 }\n'
     sweep = '[[sweep]]\nlaws = ["linear", "neo-hookean"]'
     found = all_cases(tmp_path, ONE_SCENE + reference + sweep)

@@ -1,5 +1,4 @@
-"""The figures of a run: its error against a reference, means of its steps, medians of its
-repeats."""
+"""The figures of a run: error against a reference, means of steps, medians of repeats."""
 
 import math
 from pathlib import Path
@@ -23,7 +22,7 @@ from msmpetsc.study.metrics import (
 def result(
     path: Path, times: list[float], positions: list[np.ndarray], mass: list[float], **series
 ) -> Path:
-    """A result file; positions (n, 3) of each time, the first at rest."""
+    """Write a result with positions (n, 3) at each time, the first at rest."""
     with ResultFile(path, MPI.COMM_SELF, {"scene": ""}) as file:
         file.write("lattice/nodes", positions[0])
         file.write("lattice/mass", np.array(mass, float))
@@ -35,9 +34,11 @@ def result(
 
 
 def test_the_trajectory_error_of_a_motion_by_hand(tmp_path: Path):
-    """Two nodes of 1 and 4 kg: node 0 moves by 3 and 0 at the two common times, node 1 by 0 and 2;
-    node 1 is off by 1 once, node 0 by 2 once: sqrt((4 * 1 + 1 * 4) / (1 * 9 + 4 * 4)) = sqrt(8 /
-    25)."""
+    """Two nodes have masses of 1 and 4 kg, and the error is the root of 8 / 25.
+
+    Node 0 moves by 3 and 0 at the two common times, node 1 by 0 and 2. Node 1 is off by 1 once,
+    node 0 by 2 once.
+    """
     rest = np.array([[0.0, 0, 0], [1, 0, 0]])
     x, z = np.array([[1.0, 0, 0], [0, 0, 0]]), np.array([[0.0, 0, 0], [0, 0, 1]])
     reference = result(tmp_path / "r.h5", [0, 0.1, 0.2], [rest, rest + 3 * x, rest + 2 * z], [1, 4])
@@ -64,7 +65,7 @@ def test_runs_without_common_times_or_nodes_have_no_trajectory_error(tmp_path: P
 
 
 def test_means_are_of_steps_and_leave_the_first_frame_out(tmp_path: Path):
-    """Frames of 2 steps: 9 s, 2 s and 4 s of computing; the first does not count."""
+    """Frames of 2 steps take 9 s, 2 s and 4 s of computing; the first does not count."""
     positions = [np.zeros((1, 3))] * 4
     file = result(
         tmp_path / "x.h5", [0, 0.2, 0.4, 0.6], positions, [1], wall_time=[0, 9.0, 2.0, 4.0],
@@ -101,8 +102,7 @@ def test_a_rigid_motion_is_no_error_of_shape():
 
 
 def test_the_error_of_a_swollen_body_by_hand():
-    """All grows by 10% about the centre of mass: a tenth of the root mean square distance from
-    it."""
+    """Growth by 10% gives a tenth of the root mean square distance from the centre of mass."""
     rest, mass = block()
     centre = mass @ rest / mass.sum()
     spread = math.sqrt(mass @ ((rest - centre) ** 2).sum(axis=1) / mass.sum())
@@ -111,7 +111,7 @@ def test_the_error_of_a_swollen_body_by_hand():
 
 
 def test_a_mirrored_body_is_not_in_its_rest_shape():
-    """Mirrored through the thinnest side, at best: two masses at +-a along it are 2 a off."""
+    """The best mirror plane is across the thinnest side: two masses at +-a are off by 2 a."""
     rest = np.array(
         [[2.0, 0, 0], [-2, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 0.5], [0, 0, -0.5], [1, 0.5, 0.3]]
     )

@@ -1,4 +1,4 @@
-"""The processes of a study: under mpiexec, and with more ranks than cores."""
+"""The processes of a study, under mpiexec, with more ranks than cores."""
 
 import os
 import subprocess
@@ -27,9 +27,9 @@ def processes():
 def test_a_process_alone_takes_no_folder_from_others(
     tmp_path: Path, processes: Processes, monkeypatch
 ):
-    """A process that ended once removed a folder that a new process used: a case in 300 failed.
+    """A process that ends must not remove a folder that a new process uses.
 
-    Open MPI 5 leaves the folders.
+    A case in 300 failed in this way. Open MPI 5 leaves the folders.
     """
     (tmp_path / "shared").mkdir()
     monkeypatch.setenv("TMPDIR", str(tmp_path / "shared"))
@@ -77,7 +77,7 @@ def test_a_case_may_have_more_ranks_than_cores(monkeypatch):
 def test_what_root_must_set_for_mpiexec_is_said(
     tmp_path: Path, processes: Processes, monkeypatch: pytest.MonkeyPatch
 ):
-    """By a study's cases, check --ranks and doctor, in place of the last line of Open MPI's."""
+    """Cases of a study, check --ranks and doctor say it, instead of Open MPI's last line."""
     for name in AS_ROOT:
         monkeypatch.delenv(name)
     words = ["OMPI_ALLOW_RUN_AS_ROOT=1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1"]

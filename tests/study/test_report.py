@@ -75,7 +75,7 @@ SWEEP = [
 
 @pytest.fixture(scope="module")
 def study(tmp_path_factory) -> Path:
-    """A folder with a report that has two kinds of charts."""
+    """Return a folder with a report that has two kinds of charts."""
     folder = write_rows(tmp_path_factory.mktemp("study"), ERRORS + SWEEP)
     (folder / "study.toml").write_text('title = "Fast & exact"\n')
     assert write_report(folder) == folder / "report.html"
@@ -146,12 +146,12 @@ def test_twenty_options_are_told_apart_by_colour_and_mark():
 
 
 def values(panel: Axes, column: str) -> list:
-    """The values of all layers of a panel that have this column."""
+    """Return the values of all layers of a panel that have this column."""
     return [value for layer in panel.layers for value in layer["data"]["values"] if column in value]
 
 
 def curves_in(chart: Chart) -> dict[str, set[str]]:
-    """The curves of each panel, by its title."""
+    """Return the curves of each panel, by its title."""
     return {
         spaced(panel.title): {value["curve"] for value in values(panel, "curve")}
         for panel in chart.panels
@@ -280,7 +280,7 @@ def test_tables_with_little_in_them(tmp_path: Path, rows: list, charts: int):
 
 
 def test_surface_errors_are_drawn_over_cost_a_curve_a_way_to_step(tmp_path: Path):
-    """Fill is both cheaper and more exact than whole cells but for their coarsest."""
+    """Fill is both cheaper and more accurate than whole cells, except on the coarsest lattice."""
     rows = [
         row_of(label, scene="heart", cells=n, time_frame=time, surface_error=error)
         for label, errors in (("whole", (0.3, 0.2, 0.1)), ("fill", (0.2, 0.05, 0.01)))
@@ -318,14 +318,15 @@ def profiled() -> list[dict[str, str]]:
             failed = {"status": "timeout", "cells": ""} if time is None else {}
             given = {"error": 1e-3, "cells": 1000 * (n + 1), "time_frame": time or ""} | failed
             rows.append(row_of(label, **given))
-    # the last problem is solved by a third method's budget alone, which is no
-    # comparison
+    # only a third method's budget solves the last problem, which is no comparison
     return [*rows, row_of("newton", max_iterations=1, time_frame=1e-9, cells=1000)]
 
 
 def test_a_profile_is_the_share_within_each_factor():
-    """Factors of newton: 1, 2, 2, 1; of anderson: 3, 1, 1, fails. All fail on the fifth problem,
-    whose cells nobody has counted."""
+    """Factors of newton are 1, 2, 2, 1; of anderson 3, 1, 1 and a failure.
+
+    All methods fail on the fifth problem, whose cells are not counted.
+    """
     table = as_table(profiled())
     (chart,) = profile_charts(table, curve_styles(table["label"]))
     (problems,) = comparable(table)

@@ -1,4 +1,4 @@
-"""Runs of a study: which, how often, and its response to failures. The runs are stand-ins."""
+"""Runs of a study: which runs, how often, and failures. The runs are stand-ins."""
 
 # ruff: noqa: F811 (fixtures are imported)
 import os
@@ -53,7 +53,7 @@ def test_finished_cases_are_not_run_again(tmp_path: Path, stand_in):
     text = ONE_SCENE + '[[sweep]]\npresets = ["newton"]\nerrors = '
     first = carry_out(tmp_path, text + "[0.1, 0.01]")
     assert len(calls(tmp_path)) == 2
-    # an old case is gone, a new case came, a case is kept
+    # an old case is gone, a new case was added, a case is kept
     again = carry_out(tmp_path, text + "[0.2, 0.01]")
     assert len(calls(tmp_path)) == 3
     assert [row["error"] for row in again] == [0.2, 0.01] and again[1] == first[1]
@@ -62,7 +62,7 @@ def test_finished_cases_are_not_run_again(tmp_path: Path, stand_in):
 
 
 def test_parts_run_apart_and_are_joined(tmp_path: Path, stand_in):
-    """Three cases in parts of 2 cases and 1. A part is run twice, its cases once."""
+    """Three cases run in parts of 2 cases and 1. A part is run twice, its cases once."""
     text = ONE_SCENE + '[[sweep]]\npresets = ["newton"]\nerrors = [0.3, 0.2, 0.1]'
     path, out = study_file(tmp_path, text), tmp_path / "out"
     found = {index: run_study(path, out, part=(index, 2)) for index in (2, 1, 2)}

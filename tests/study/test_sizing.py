@@ -52,8 +52,7 @@ def test_three_sizes_tell_order_and_error(order: float, sizes: tuple):
 
 
 def test_an_order_that_cannot_be_is_not_believed():
-    """Distances that do not shrink have no order: the least is taken, which makes the error the
-    greatest."""
+    """If distances do not shrink, the least order is taken, which gives the greatest error."""
     stuck = error_law((4, 2, 1), [0.05, 0.05], ORDERS)
     assert not stuck.observed and stuck.order == 1 and stuck.error(1) == pytest.approx(0.05)
     steep = error_law((4, 2, 1), [0.5, 0.01], ORDERS)
@@ -70,9 +69,9 @@ def test_an_error_that_jumps_between_two_like_sizes_has_a_law():
 
 @pytest.mark.parametrize(("order", "cosine"), [(1.0, 0.0), (1.5, 0.0), (1.5, 0.5), (2.0, 0.9)])
 def test_lattices_that_err_by_chance(order: float, cosine: float):
-    """The difference of two runs is at an angle to the finer run's error.
+    """The difference of two runs is at an angle to the error of the finer run.
 
-    An angle of 0 would give too much.
+    An angle of 0 would overestimate the error.
     """
     sizes, e = (4.0, 2.0, 1.0), [0.03 * size**order for size in (4, 2, 1)]
     first, second = (math.sqrt(a**2 - (1 - cosine**2) * b**2) - cosine * b for a, b in pairwise(e))
@@ -86,13 +85,13 @@ def test_lattices_that_err_by_chance(order: float, cosine: float):
 
 
 class Bodies:
-    """A bench whose runs are formulas.
+    """A bench whose runs follow formulas.
 
     The error has parts of cells, of order 1.5, of time steps and of their solution.
 
     explicit   : whether verlet runs, at a third of the cost of BDF2
     cell_error : error of a single cell [-]; most: largest error of the cells [-]
-    inverted   : cells inside out at the end, by cells
+    inverted   : function of the cells: number of cells inside out at the end
     """
 
     def __init__(
@@ -153,7 +152,7 @@ def sized(
 def test_the_plan_meets_the_error_and_wastes_little(
     tmp_path: Path, monkeypatch, explicit: bool, target: float
 ):
-    """The choice's own error by the formula is a little below the error asked for."""
+    """The choice's own error by the formula is slightly below the error asked for."""
     plan, bench, _ = sized(tmp_path, monkeypatch, target, explicit=explicit)
     method, cells = plan.choice.method, plan.choice.cells
     assert plan.met and not plan.bounds and (method.integrator == "verlet") == explicit
@@ -164,7 +163,7 @@ def test_the_plan_meets_the_error_and_wastes_little(
 
 @pytest.mark.parametrize("cell_error", [1.5, 3.7, 5.2])
 def test_the_error_of_a_choice_is_what_is_said(tmp_path: Path, monkeypatch, cell_error: float):
-    """Choices of fewer cells than the finest lattice, of nearly as many and of many more."""
+    """The choice may have fewer cells than the finest lattice, nearly as many, or many more."""
     plan, bench, _ = sized(tmp_path, monkeypatch, 0.04, cell_error=cell_error, explicit=False)
     true = bench.error_of(plan.choice.method, plan.choice.cells)
     assert plan.met and plan.choice.budget.total == pytest.approx(true, rel=0.2)
@@ -174,9 +173,9 @@ def test_the_error_of_a_choice_is_what_is_said(tmp_path: Path, monkeypatch, cell
 def test_a_choice_is_little_better_than_asked_for_where_lattices_err_by_chance(
     tmp_path: Path, monkeypatch, target
 ):
-    """The difference of two runs is at right angles to the finer run's error, of order 1.
+    """The difference of two runs is at right angles to the error of the finer run, of order 1.
 
-    Their sum was twice as much.
+    The sum of both would be twice as much.
     """
 
     monkeypatch.setattr(Bodies, "error_of", lambda self, method, cells: 1.4 * cells ** (-1 / 3))
@@ -186,7 +185,7 @@ def test_a_choice_is_little_better_than_asked_for_where_lattices_err_by_chance(
 
 
 def test_statics_are_planned_by_their_cells_alone(tmp_path: Path, monkeypatch):
-    """Nor do they want a step and a duration."""
+    """Static scenes need neither a step nor a duration."""
     monkeypatch.setattr(
         sys.modules[__name__], "SCENE", SCENE.replace("step = 0.01, duration = 0.1", STATIC)
     )
@@ -203,8 +202,10 @@ def test_statics_are_planned_by_their_cells_alone(tmp_path: Path, monkeypatch):
 
 
 def test_few_cells_are_tried_first(tmp_path: Path, monkeypatch):
-    """64,000 cells may be tried: 0.1 takes a hundred, which 1,000 tell; 0.01 takes as many as there
-    are."""
+    """An error of 0.1 needs 100 of 64,000 cells allowed, which trials of 1,000 show.
+
+    An error of 0.01 needs trials of all 64,000.
+    """
     for target, finest in ((0.1, 1000), (0.01, 64_000)):
         plan, bench, _ = sized(tmp_path, monkeypatch, target, 64_000)
         assert plan.met and max(each.cells for each in plan.tried) == finest
@@ -215,7 +216,7 @@ def test_few_cells_are_tried_first(tmp_path: Path, monkeypatch):
 def test_thin_walls_are_tried_on_enough_cells(
     tmp_path: Path, monkeypatch, advised: float, finest: int
 ):
-    """And the plan says so if it chooses fewer: 0.1 takes a hundred."""
+    """The plan says that the hundred cells for an error of 0.1 are too few for thin walls."""
     plan, *_ = sized(tmp_path, monkeypatch, 0.1, 64_000, advised)
     assert max(each.cells for each in plan.tried) == finest
     told = (
@@ -225,7 +226,7 @@ def test_thin_walls_are_tried_on_enough_cells(
 
 
 def test_where_the_error_jumps_the_fewest_cells_beyond_are_taken(tmp_path: Path, monkeypatch):
-    """The error jumps at 300 cells, as if a foot folds differently.
+    """The error jumps at 300 cells, as if a foot folded differently.
 
     No lattice has the error asked for, or slightly less.
     """
@@ -248,14 +249,14 @@ def test_a_coarsest_lattice_that_is_good_by_chance_takes_no_cells(tmp_path: Path
 
 
 def test_no_refusal_without_a_finer_lattice(tmp_path: Path, monkeypatch):
-    """The error is 8 / sqrt(cells), and 8 times 6,400 cells are the most."""
+    """The error is 8 / sqrt(cells), and at most 8 times 6,400 cells are allowed."""
     plan, _, _ = sized(tmp_path, monkeypatch, 0.03, cell_error=8.0)
     assert not plan.met
     assert max(each.cells for each in plan.tried) == round(6400 * 2**1.5)
 
 
 def test_a_choice_that_fails_is_not_made(tmp_path: Path, monkeypatch):
-    """Verlet runs away on the chosen cells, though not on the cells tried before.
+    """Verlet fails on the chosen cells, but not on the cells tried before.
 
     The plan takes BDF2 and says so.
     """
@@ -274,18 +275,18 @@ def test_a_choice_that_fails_is_not_made(tmp_path: Path, monkeypatch):
 
 
 def test_where_the_coarsest_lattice_fails_a_finer_one_stands_in(tmp_path: Path, monkeypatch):
-    """As where a pin holds no node: the order is seen all the same."""
+    """The order is found although the coarsest lattice fails, as without a pinned node."""
     plan, *_ = sized(tmp_path, monkeypatch, 0.1, fails=lambda _, cells: cells == 100)
     assert plan.met and not plan.bounds and {each.cells for each in plan.tried} >= {200, 800, 6400}
 
 
 def test_lattices_alike_are_one_lattice(tmp_path: Path, monkeypatch):
-    """A single cell is its own coarser lattice."""
+    """A lattice of a single cell has no coarser lattice."""
     with pytest.raises(InputError, match=r"only one lattice could be run.*--cells N"):
         sized(tmp_path, monkeypatch, 0.1, cells=1)
 
 
-# by the bound of the error: the target, and properties of the bodies
+# by the words of the limit: the target, and properties of the bodies
 BOUNDS = {
     # at most 8 times the cells are allowed, which leaves 1.8e-2
     "the mesh's cells": (
@@ -294,7 +295,7 @@ BOUNDS = {
     ),
     # two integrators do not agree
     "the step": (0.1, {"impacts": True}),
-    # the trials differ by 0.4, so the usual order is taken
+    # the trials differ by 0.4, so the usual order is assumed
     "the cells: their distances show no order": (
         0.2,
         {"cell_error": 5.0, "most": 0.45},
@@ -313,7 +314,7 @@ def test_a_plan_says_what_bounds_the_error(tmp_path: Path, monkeypatch, bound: s
 
 
 def test_a_plan_says_that_cells_end_inside_out(tmp_path: Path, monkeypatch):
-    """On the finest lattice tried, so order 1 is assumed. Coarser lattices do not matter."""
+    """Cells of the finest lattice count, so order 1 is assumed. Coarser lattices do not matter."""
     plan, _, _ = sized(
         tmp_path, monkeypatch, 0.1, inverted=lambda cells: 7.0 if cells == 6400 else 0.0
     )
@@ -361,7 +362,7 @@ def soft_beam(tmp_path: Path) -> Path:
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_the_true_error_of_a_plan_is_what_was_asked_for(soft_beam: Path):
-    """A soft beam, against a run in explicit substeps, whose own error is little."""
+    """The plan of a soft beam meets a run in explicit substeps, whose own error is small."""
     words = ["--surface-error", "0.1", "--cells", "1000", "--frames", "20", "--write"]
     assert status_of("plan", soft_beam, *words) == 0
     every = max(1, round(1 / 60 / load_scene(soft_beam).time.step))
@@ -377,7 +378,7 @@ def test_the_true_error_of_a_plan_is_what_was_asked_for(soft_beam: Path):
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_the_true_error_of_a_plan_of_statics_is_what_was_asked_for(soft_beam: Path):
-    """The soft beam where it comes to rest under its weight, to twice as little."""
+    """The plan of a soft beam at rest under its weight meets an error of 0.05."""
     text = soft_beam.read_text()
     time = text[text.index("[time]") : text.index("[gravity]")]
     soft_beam.write_text(text.replace(time, f"[time]\n{STATIC}\n\n"))
@@ -455,7 +456,7 @@ BEFORE = {
 def test_the_command_of_a_plan_says_what_its_lines_say(
     tmp_path: Path, given: str, method: PlannedMethod
 ):
-    """Run with these changes the scene is the same as with the answer written into it."""
+    """With the printed changes the scene is the same as with the choice written into it."""
     mesh = (
         'mesh.source = "beam.obj"\ncages.count = 10\n'
         "material = { density = 1, young_modulus = 1 }\n"

@@ -1,4 +1,4 @@
-"""Fields on a surface: each on a motion of which it is known."""
+"""Fields on a surface, each for a motion whose field is known."""
 
 import tomllib
 from collections.abc import Iterator
@@ -59,7 +59,7 @@ def test_stress_is_von_mises_at_the_nodes_in_a_unit_of_its_size(subject):
 
 
 def test_strain_is_the_root_mean_square_of_the_springs_at_a_node():
-    """Three nodes in a row: the first spring 10% longer, the second 20% shorter."""
+    """The first of two springs between three nodes is 10% longer, the second 20% shorter."""
     points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
     moved = np.array([[0.0, 0, 0], [1.1, 0, 0], [1.9, 0, 0]])
     subject = replace(
@@ -75,7 +75,7 @@ def test_strain_is_the_root_mean_square_of_the_springs_at_a_node():
 
 
 def test_parts_are_those_of_the_nearest_cell(subject):
-    """Two cells. The later of two parts that name the second cell counts."""
+    """If two parts contain the second cell, the later part counts."""
     x, y, z = np.mgrid[0:3, 0:2, 0:2].reshape(3, -1)
     cells = np.array([np.flatnonzero((x == i) | (x == i + 1)) for i in range(2)])
     nodes, points = (
@@ -111,8 +111,10 @@ def test_the_scale_has_ticks_at_round_numbers_of_a_fitting_unit(high, unit, labe
 
 
 def test_few_points_at_a_clamp_do_not_rule_the_scale_and_it_says_so():
-    """A grid of 51 x 51 points: stress to 100 kPa along it, and 5 MPa at two points of its clamped
-    edge."""
+    """The scale ignores 5 MPa at two points of a clamp, where all else is below 100 kPa.
+
+    The surface is a grid of 51 x 51 points.
+    """
     x, y = np.mgrid[0:51, 0:51].reshape(2, -1)
     first = np.flatnonzero((x < 50) & (y < 50))
     triangles = np.concatenate([first[:, None] + [0, 51, 52], first[:, None] + [0, 52, 1]])
@@ -140,7 +142,7 @@ def test_few_points_at_a_clamp_do_not_rule_the_scale_and_it_says_so():
 
 @pytest.mark.parametrize("name", ["displacement", "speed", "stress"])
 def test_a_body_at_rest_is_not_tinted_though_its_field_is_rounded(subject, name):
-    """Shares of 1e-16 of its size, its age and its stiffness are no motion and no stress."""
+    """Motion and stress of 1e-16 of size, age and stiffness are not coloured."""
     noise = np.random.default_rng(0).uniform(-1e-16, 1e-16, (3, *subject.rest.nodes.shape))
     text = BARE.replace(
         'stiffness = 1.0, law = "linear"', 'young_modulus = 1e6, law = "neo-hookean"'

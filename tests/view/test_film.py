@@ -27,7 +27,7 @@ def render(*words: object) -> None:
 
 
 def pictures_of(path: Path) -> list[np.ndarray]:
-    """The pictures of a film as a player has them."""
+    """Return the pictures of a film as a player shows them."""
     if path.suffix != ".mp4":
         with Image.open(path) as film:
             return [
@@ -43,8 +43,7 @@ def pictures_of(path: Path) -> list[np.ndarray]:
 
 
 def middle_of_body(picture: np.ndarray) -> float:
-    """The row halfway between the first and the last with pixels that are clearly blue: the
-    body's."""
+    """Return the row halfway between the first and the last row with clearly blue pixels."""
     rows = np.flatnonzero((picture[..., 2] - picture[..., 0] > 15).sum(axis=1) > 3)
     return (rows[0] + rows[-1]) / 2
 
@@ -73,8 +72,7 @@ def test_the_film_of_a_third_of_a_second_says_how_much_slower_it_is():
 
 
 def test_a_film_fills_its_frame_and_says_its_speed(falling_ball, tmp_path, caplog):
-    """The ball's way is four times as high as wide, and so is the film, as far as its caption lets
-    it."""
+    """The ball's path is four times as high as wide, and so is the film without its caption."""
     with caplog.at_level("INFO", logger="msmpetsc"):
         render(falling_ball, "-o", tmp_path / "x.gif")
     with Image.open(tmp_path / "x.gif") as film:
@@ -91,7 +89,7 @@ def test_a_film_fills_its_frame_and_says_its_speed(falling_ball, tmp_path, caplo
 def test_slow_motion_shows_all_frames_for_longer(falling_ball, tmp_path):
     slow = playback_of(TIMES, speed=0.1)
     assert slow.fps == pytest.approx(1) and len(slow.numbers) == 11
-    # at least a picture a second, so five pictures a frame
+    # at least a picture a second, so five pictures per frame
     slower = playback_of(TIMES, speed=0.02)
     assert len(slower.numbers) == 51 and (abs(np.bincount(slower.numbers)[1:-1] - 5) <= 1).all()
     render(falling_ball, "-o", tmp_path / "x.gif", "--frames", "0:3", "--speed", 0.05)
@@ -138,8 +136,7 @@ def test_the_ball_falls_and_leaps_in_the_film(falling_ball, tmp_path, ending, ca
 
 
 def test_the_legend_names_what_is_drawn(falling_ball, tmp_path):
-    """The bar of colours goes from the neutral grey to the darkest, and without colours there is
-    none."""
+    """The legend goes from neutral grey to the darkest colour; without colours there is none."""
     for name, words in {"plain": [], "coloured": ["--colour", "displacement"]}.items():
         render(falling_ball, "-o", tmp_path / f"{name}.png", "--frames", "0,5", *words)
     plain, coloured = (
@@ -183,8 +180,7 @@ def test_what_cannot_be_drawn_ends_in_one_line(falling_ball, words, line):
     "sides", [(1.0, 0.1, 0.1), (0.1, 0.1, 1.0), (0.3, 0.3, 0.3)], ids=["long", "high", "cube"]
 )
 def test_no_third_of_a_film_is_empty(sides, tmp_path):
-    """A box that sways by a tenth of its longest side: in each third of the picture it is seen at
-    some time."""
+    """A box that sways by a tenth of its longest side reaches each third of the picture."""
     box = trimesh.creation.box(sides).subdivide().subdivide()
     sway = 0.1 * max(sides) * np.array([1.0, 0, 0])
     points = np.array(box.vertices)

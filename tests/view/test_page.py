@@ -37,7 +37,7 @@ def stream(data: dict, name: str) -> np.ndarray:
 
 
 def restored(raw: np.ndarray, frames: int) -> np.ndarray:
-    """The frames (f, n) of 16 bits, as page.js restores them."""
+    """Return the frames (f, n) of 16 bits as page.js restores them."""
     return np.cumsum(raw.view("<u2").reshape(frames, -1), axis=0, dtype=np.uint16)
 
 

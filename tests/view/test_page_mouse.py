@@ -1,5 +1,4 @@
-"""The page of a result in a browser, driven by mouse and keys: it turns, comes nearer, plays, goes
-to a frame."""
+"""The page of a result in a browser by mouse and keys: it turns, zooms, plays, goes to a frame."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +14,7 @@ pytestmark = in_browser
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A ball that is dark on its east, seen from there."""
+    """Write the page of a ball that is dark on its east, seen from the east."""
     folder = tmp_path_factory.mktemp("page")
     result = write_ball(folder / "x.h5", scene=BARE + EAST_HELD)
     render(result, "-o", folder / "x.html", "--eye", "1,0,0")
@@ -30,25 +29,24 @@ def opened(path: Path) -> Iterator[Browser]:
 
 @pytest.fixture
 def browser(opened: Browser) -> Browser:
-    """The page as it is when it was opened."""
+    """Open the page in a browser in its first view."""
     opened.value("setPlaying(false), goTo(0)")
     opened.key("r")
     return opened
 
 
 def seen(browser: Browser) -> np.ndarray:
-    """The rows and columns (k, 2) of the pixels of the body, on a white page."""
+    """Return rows and columns (k, 2) of the pixels of the body on a white page."""
     return np.argwhere(browser.picture().min(axis=2) < 200)
 
 
 def dark(browser: Browser) -> int:
-    """How many pixels are as dark as the part that is held."""
+    """Return the number of pixels as dark as the held part."""
     return int((browser.picture()[..., 0] < 58).sum())
 
 
 def test_dragging_turns_the_body(browser: Browser):
-    """Half a turn is 450 pixels: the dark side, seen first, is behind then, and back after the
-    other half."""
+    """Half a turn is 450 pixels: the dark side is then behind, and back after the other half."""
     before = dark(browser)
     left, middle = np.array(browser.middle("#view")) - [225, 0], browser.middle("#view")
     browser.drag(tuple(left), (450, 0))
@@ -107,7 +105,7 @@ def test_play_plays_and_pauses(browser: Browser):
 def test_the_slider_goes_to_a_frame(browser: Browser):
     """The fourth of eleven frames is at 3/10 of the slider.
 
-    The ball is 0.4 m lower than at the start.
+    The ball is then 0.4 m lower than at the start.
     """
     first = seen(browser)
     # pixels per metre; the ball is 0.2 m wide

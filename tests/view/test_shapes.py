@@ -1,4 +1,4 @@
-"""Obstacles that are meshes are drawn at their places, from the data of the result."""
+"""Obstacles that are meshes are drawn at their positions, from the data of the result."""
 
 from pathlib import Path
 
@@ -54,12 +54,12 @@ TWO_BARS = (
 
 @pytest.fixture
 def result(tmp_path: Path) -> Path:
-    """The ball, and beside it a cube that sinks with it, slower."""
+    """Return the result of a ball, and beside it a cube that sinks with it, but more slowly."""
     return with_mesh(write_ball(tmp_path / "x.h5", scene=BARE + STATUE), [LOW, HIGH])
 
 
 def with_mesh(path: Path, bounds) -> Path:
-    """A result whose obstacle 1 is a mesh, a box between two corners."""
+    """Return a result whose obstacle 1 is a mesh, a box between two corners."""
     cube = trimesh.creation.box(bounds=bounds)
     with h5py.File(path, "r+", libver="earliest") as file:
         file["obstacle/points"], file["obstacle/triangles"] = cube.vertices, cube.faces
@@ -68,7 +68,7 @@ def with_mesh(path: Path, bounds) -> Path:
 
 
 def right_of_the_ball(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return rows and columns drawn a diameter or more right of the ball, and the diameter."""
+    """Return rows and columns drawn at least a diameter right of the ball, and the diameter."""
     rows, columns = np.nonzero(picture.min(axis=2) < 230)
     left = columns.min()
     # ball from 0 to 0.2 m, cube from 0.25 to 0.35 m
@@ -112,7 +112,7 @@ def test_a_page_has_it_once_and_moves_it(result: Path):
 
 @in_browser
 def test_a_bar_that_turns_is_drawn_as_it_has_turned(tmp_path: Path):
-    """Lying at first, upright at the end; a box and a mesh alike."""
+    """A box and a mesh, lying at first, are upright at the end."""
     path = with_mesh(
         write_ball(tmp_path / "x.h5", scene=BARE + "picture.eye = [0, -1, 0]" + TWO_BARS), BAR
     )

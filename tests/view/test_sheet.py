@@ -1,6 +1,6 @@
 """Contact sheets: the moments, the axes, and the content of a picture.
 
-No picture is compared as an image.
+No test compares pictures pixel by pixel.
 """
 
 import os
@@ -45,7 +45,7 @@ def test_moments_tell_the_story(falling_ball):
 
 @pytest.fixture
 def stills(tmp_path):
-    """stills(scene tables, frames, eye) of a sheet that is not drawn."""
+    """Return the function stills(scene tables, frames, eye) of a sheet that is not drawn."""
 
     def stills_of(
         tables: str, frames: list[int], eye: tuple[float, ...] | None = None
@@ -78,7 +78,7 @@ def test_camera_stands_upright_and_at_the_eye(gravity, eye):
     axes = np.array([camera.right, camera.away, camera.up])
     assert axes @ axes.T == pytest.approx(np.eye(3)) and np.linalg.det(axes) == pytest.approx(1)
     assert axes @ gravity == pytest.approx([0, 0, -np.linalg.norm(gravity)])
-    # the picture is no mirror image
+    # the picture is not mirrored
     assert np.cross(camera.right, camera.upward) == pytest.approx(camera.to_eye)
     assert camera.upward @ camera.up > -1e-9
     if eye is not None:
@@ -243,12 +243,12 @@ def test_glass_is_seen_at_its_place_and_through(tmp_path):
 
 
 def is_body(picture: np.ndarray) -> np.ndarray:
-    """Which pixels show the body: only it is clearly blue."""
+    """Return which pixels show the body: only the body is clearly blue."""
     return picture[..., 2].astype(int) - picture[..., 0] > 25
 
 
 def body_rows(picture: np.ndarray) -> tuple[int, int]:
-    """First and last row of pixels that show the body; it must not reach the picture's edges."""
+    """Return the body's first and last row of pixels; it must not reach the picture's edges."""
     blue = is_body(picture)
     assert (
         not blue[:, 0].any() and not blue[:, -1].any() and not blue[0].any() and not blue[-1].any()
@@ -286,7 +286,7 @@ def test_a_result_without_surface_or_with_a_strange_scene_is_told(tmp_path):
 
 
 def test_without_opengl_one_line_names_the_package(falling_ball, tmp_path):
-    """EGL is made to find no driver; VTK would crash."""
+    """Without an EGL driver VTK would crash."""
     draw = "import sys; from msmpetsc.view.sheet import contact_sheet; contact_sheet(*sys.argv[1:])"
     environment = {key: value for key, value in os.environ.items() if key != "DISPLAY"}
     environment |= {"__EGL_VENDOR_LIBRARY_DIRS": "/nonexistent", "PYTHONPATH": str(ROOT)}
@@ -299,7 +299,7 @@ def test_without_opengl_one_line_names_the_package(falling_ball, tmp_path):
 
 
 def test_many_panels_stand_in_rows_and_each_is_shown(falling_ball, tmp_path):
-    """Eleven of them in two rows of six, in a sheet that a screen shows."""
+    """Eleven panels are in two rows of six, in a sheet that fits a screen."""
     sheet.contact_sheet(falling_ball, tmp_path / "x.png", frames=range(11))
     drawn = np.array(Image.open(tmp_path / "x.png"))
     assert 1000 < drawn.shape[1] <= 2000
@@ -309,7 +309,7 @@ def test_many_panels_stand_in_rows_and_each_is_shown(falling_ball, tmp_path):
 
 
 def test_all_that_is_written_is_in_one_typeface(falling_ball, tmp_path, monkeypatch):
-    """Captions and the legend."""
+    """Captions and the legend use the same typeface."""
     written, draw = {}, ImageDraw.ImageDraw.text
 
     def recorded(self, at, text, fill=None, font=None, **options):

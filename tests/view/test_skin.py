@@ -1,4 +1,4 @@
-"""The surface as drawn: points put into long edges, and sharp edges that split the shading."""
+"""The surface as drawn: points in long edges, and sharp edges that split the shading."""
 
 from dataclasses import replace
 
@@ -20,12 +20,12 @@ CELLS, H = np.array([16, 2, 2]), 1 / 16
 
 
 def bent(points: np.ndarray) -> np.ndarray:
-    """A beam whose end sinks by 0.3 m."""
+    """Return a beam whose end sinks by 0.3 m."""
     return points - 0.3 * points[:, [0]] ** 2 * [0, 0, 1]
 
 
 def block() -> Drawable:
-    """A block of 12 triangles and its 64 cells, at rest and bent."""
+    """Return a block of 12 triangles and its 64 cells, at rest and bent."""
     box = trimesh.creation.box(bounds=[[0, 0, 0], H * CELLS])
     points, triangles = np.array(box.vertices), np.array(box.faces)
     nodes = np.stack(
@@ -56,7 +56,7 @@ def test_a_block_of_twelve_triangles_is_drawn_as_its_cells_bend():
     ).max()
     assert longest <= H * (1 + 1e-9)
     # trilinear between nodes: 0.3 h^2 / 4 off the parabola in the middle of a cell,
-    # where 12 triangles are 0.075 off
+    # where 12 triangles are off by 0.075
     assert points == pytest.approx(bent(rest), abs=0.3 * H**2 / 4 + 1e-9)
     assert subject.embedding @ subject.nodes(1) == pytest.approx(points)
 
@@ -71,7 +71,7 @@ def test_long_edges_are_divided_without_holes():
 
 
 def test_normals_are_split_at_sharp_edges_alone():
-    """A cube has three normals at each corner, a ball of fine triangles a single normal a point."""
+    """A cube has three normals at each corner, a fine ball a single normal per point."""
     cube, ball = trimesh.creation.box([1, 1, 1]), trimesh.creation.icosphere(subdivisions=2)
     origin, triangles = split_at_edges(np.array(cube.vertices), np.array(cube.faces))
     assert len(origin) == 24 and (origin[triangles] == cube.faces).all()
@@ -85,7 +85,7 @@ def test_normals_are_split_at_sharp_edges_alone():
 
 @pytest.mark.parametrize(("degrees", "points"), [(25, 6), (35, 8)])
 def test_an_edge_is_sharp_from_thirty_degrees_on(degrees: float, points: int):
-    """Two squares that meet at an edge of two points."""
+    """Two squares meet in an edge of two points."""
     angle = np.radians(degrees)
     ends = [(-1, 0), (0, 0), (np.cos(angle), np.sin(angle))]
     corners = np.array([(x, y, z) for x, z in ends for y in (0, 1)])
@@ -94,14 +94,14 @@ def test_an_edge_is_sharp_from_thirty_degrees_on(degrees: float, points: int):
 
 
 def test_a_mesh_whose_triangles_share_no_points_is_drawn_smooth():
-    """As an STL has them."""
+    """Triangles without shared points are as in an STL file."""
     ball = trimesh.creation.icosphere(subdivisions=2)
     loose = np.array(ball.triangles.reshape(-1, 3)), np.arange(3 * len(ball.faces)).reshape(-1, 3)
     assert len(np.unique(drawn(drawable_of(*loose)).triangles)) == len(ball.vertices)
 
 
 def test_pins_are_coloured_up_to_where_half_of_a_point_is_held():
-    """A flat strip from above, held at an end: two colours, and none between them."""
+    """A flat strip, held at one end, has two colours seen from above, and none in between."""
     x = np.arange(6.0)
     points = np.array([(a, b, 0) for a in x for b in (0, 1)])
     triangles = np.array(
@@ -139,8 +139,7 @@ def test_bodies_have_a_colour_each():
 
 
 def test_a_clamp_ends_in_a_straight_line_whatever_the_triangles():
-    """The front of a block in triangles of any shape; its nodes are pinned up to a plane of the
-    lattice."""
+    """Triangles of any shape form the front of a block, pinned up to a plane of the lattice."""
     whole, size = block(), H * CELLS
     inner = np.random.default_rng(0).uniform([0, 0], size[[0, 2]], (400, 2))
     flat = np.concatenate([np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * size[[0, 2]], inner])

@@ -1,4 +1,4 @@
-"""Scenes drawn before anything is run."""
+"""Scenes are drawn before they run."""
 
 from pathlib import Path
 
@@ -19,14 +19,13 @@ SCENE = {
 
 
 def drawn(*words: object) -> np.ndarray:
-    """The picture that a command draws; its path is the last word."""
+    """Return the picture that a command draws; the last word is its path."""
     render(*words[:-1], "-o", words[-1])
     return np.array(Image.open(words[-1]).convert("RGB")).astype(int)
 
 
 def sized(folder: Path, sides: tuple[float, float, float]) -> Path:
-    """A block with the points of its west side painted, pinned by a file, and pulled at its
-    east."""
+    """Write a block whose west side is painted and pinned by a file, and whose east is pulled."""
     path = block_scene(folder, np.array(sides), **SCENE)
     # corners of a box are numbered along x, so these are its x = 0 face
     (folder / "spots.txt").write_text("0 1 2 3\n")

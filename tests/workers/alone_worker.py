@@ -35,7 +35,7 @@ def fail_at(place: str, error: str, fails: bool) -> None:
 
 if __name__ == "__main__":
     failing = [int(rank) for rank in sys.argv[1].split(",")]
-    # the others have seconds to be ended in, whatever else the machine does
+    # the other ranks have seconds to be ended in, whatever else the machine does
     if MPI.COMM_WORLD.rank == failing[0]:
         abort.PATIENCE = 1.0
     fail_at(*sys.argv[2:4], fails=MPI.COMM_WORLD.rank in failing)

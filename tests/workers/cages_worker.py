@@ -1,4 +1,4 @@
-"""Run under mpiexec: cages_worker.py FOLDER (of meshes) by test_cages.py."""
+"""Fill meshes under mpiexec, for test_cages.py: cages_worker.py FOLDER."""
 
 import sys
 from pathlib import Path
@@ -14,7 +14,7 @@ FILLED = [("closed", 0.11), ("open", 0.11), ("one cell", 2.5)]
 
 
 def body_of(path: Path) -> BodySurface:
-    """A body from points and triangles in an .npz file, which only rank 0 holds."""
+    """Return a body from points and triangles in an .npz file, which only rank 0 holds."""
     data = np.load(path)
     surface = Surface(data["points"], data["triangles"])
     bounds = np.array([surface.points.min(axis=0), surface.points.max(axis=0)])
@@ -22,7 +22,7 @@ def body_of(path: Path) -> BodySurface:
 
 
 def fill_to_file(mesh: Path, cell_size: float) -> None:
-    """Writes all cells in the order of the ranks beside the mesh."""
+    """Write all cells, in the order of the ranks, beside the mesh."""
     cages = fill([body_of(mesh)], cell_size)
     assert comm.allreduce(len(cages.kind)) == cages.table.total
     parts = comm.gather((cages.table.first, cages.ijk, cages.kind, cages.fills))

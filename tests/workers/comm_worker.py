@@ -22,8 +22,10 @@ def same(found: np.ndarray, expected: np.ndarray) -> None:
 
 
 def check_route(rng: np.random.Generator, rows: int, senders: int) -> None:
-    """``rows`` of several types, held by the first ``senders`` ranks, go anywhere and are
-    answered."""
+    """Check that ``rows`` of the first ``senders`` ranks reach any rank and are answered.
+
+    Rows have several types.
+    """
     holder = np.sort(rng.integers(0, senders, rows))
     destination = rng.integers(0, comm.size, rows)
     number = np.arange(rows)
@@ -43,7 +45,7 @@ def check_route(rng: np.random.Generator, rows: int, senders: int) -> None:
 
 
 def check_sorted_keys(rng: np.random.Generator, count: int, holders: int, limit: int) -> None:
-    """Keys that repeat within and between ranks."""
+    """Check numbers of keys that repeat within and between ranks."""
     given = rng.integers(0, limit, count)
     holder = rng.integers(0, holders, count)
     table = SortedKeys(comm, np.sort(given[holder == comm.rank]))
@@ -66,7 +68,7 @@ def check_sorted_keys(rng: np.random.Generator, count: int, holders: int, limit:
 
 
 def check_shares_are_even(rng: np.random.Generator) -> None:
-    """All keys come from a single rank, clustered. Parts end even within a few per cent."""
+    """Check that parts end even within a few per cent if a single rank has all keys."""
     given = np.unique((rng.random(40_000) ** 4 * 1e12).astype(np.int64))
     table = SortedKeys(comm, given if comm.rank == comm.size - 1 else given[:0])
     assert len(table.keys) < 1.05 * len(given) / comm.size

@@ -1,5 +1,4 @@
-"""Writes result files for test_writer.py, on as many ranks as mpiexec gives: frames_worker.py
-ACTION PATH."""
+"""Write result files for test_writer.py on all ranks: frames_worker.py ACTION PATH."""
 
 import os
 import sys
@@ -18,7 +17,7 @@ NODES, POINTS, STEPS = 23, 17, 9
 
 
 def positions(index: int, rows: int) -> np.ndarray:
-    """(rows, 3): values that tell frame, row and axis."""
+    """Return (rows, 3) values that show frame, row and axis."""
     return index + np.arange(3.0 * rows).reshape(rows, 3) / 1000
 
 
@@ -38,7 +37,7 @@ def frame(index: int, nodes: slice = slice(None), points: slice | None = slice(N
 
 
 def share(rows: int) -> slice:
-    """This rank's rows; the last rank of several has none."""
+    """Return this rank's rows; if there are several, the last rank has none."""
     size, rank = MPI.COMM_WORLD.size, MPI.COMM_WORLD.rank
     cuts = np.linspace(0, rows, max(size - 1, 1) + 1).astype(int)
     return slice(cuts[rank], cuts[rank + 1]) if rank < len(cuts) - 1 else slice(rows, rows)
@@ -69,12 +68,12 @@ def write_all(path: str) -> None:
 
 
 def gather() -> None:
-    """Rank 0 writes for all, as where the ranks do not reach the same file."""
+    """Make rank 0 write for all ranks, as if the ranks did not reach the same file."""
     writer.open_on_all_ranks = lambda *_: None
 
 
 def refuse(path: str) -> None:
-    """Prints the InputError that each rank gets."""
+    """Print the InputError that each rank gets."""
     try:
         with ResultFile(path, MPI.COMM_WORLD, {}):
             pass
@@ -83,9 +82,9 @@ def refuse(path: str) -> None:
 
 
 def fill_disk(path: str, gathers: bool = True) -> None:
-    """The disk is full at the third frame, while the ranks are sending.
+    """Fill the disk at the third frame while the ranks send their rows.
 
-    Without gathering, it is full for a rank in the midst of its rows.
+    Without gathering, it is full while a rank writes its own rows.
     """
     nodes = share(NODES)
     store = h5py.Dataset.__setitem__

@@ -1,8 +1,9 @@
-"""msmpetsc that dies after so many seconds of CPU time on rank 0:  killed_worker.py SECONDS run ...
+"""Run msmpetsc until rank 0 dies after so much CPU time: killed_worker.py SECONDS run ...
 
-Rank 0 dies by the default action of SIGPROF, as by SIGKILL: nothing is tidied up. CPU time makes
+Rank 0 dies by the default action of SIGPROF, as by SIGKILL: nothing is cleaned up. CPU time makes
 the moment independent of other work on the machine. With 0 seconds nothing dies. The CPU time of a
-finished run is printed."""
+finished run is printed.
+"""
 
 import signal
 import sys

@@ -5,7 +5,7 @@ from hierarchies import COMM, LATTICES, SHAPES, build, hierarchy
 from mpi4py import MPI
 
 WORLD = MPI.COMM_WORLD
-# lattice, shape, contact, more
+# lattice, shape, contact, further arguments
 CASES = {
     "block": ("twisted", True, {"pins": True, "contrast": 1e6}),
     "two bodies": ("crushed", False, {}),

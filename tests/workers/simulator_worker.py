@@ -1,13 +1,13 @@
-"""Scenes by kernels in numba's CUDA simulator: SCENE... -> kernels that ran, last positions.
+"""Run scenes by kernels in numba's CUDA simulator: SCENE... -> kernels that ran, last positions.
 
-The kernels are a GPU's, a thread an index, with blocks that are not full. Only the arrays are
+The kernels are a GPU's, a thread per index, with blocks that are not full. Only the arrays are
 pretended.
 """
 
 import os
 import sys
 
-# the simulator reads Python, not compiled code
+# the simulator interprets Python instead of compiled code
 os.environ |= {
     "NUMBA_ENABLE_CUDASIM": "1",
     "NUMBA_DISABLE_JIT": "1",

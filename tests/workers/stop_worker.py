@@ -1,5 +1,7 @@
-"""The command line, stopped by SIGUSR1 to the last rank after a step: stop_worker.py STEP
-ARGUMENTS; -1 for never. Checkpoints are of every second step."""
+"""Run the command line; SIGUSR1 to the last rank stops it: stop_worker.py STEP ARGUMENTS.
+
+The signal comes after STEP, never for -1. Checkpoints are written every second step.
+"""
 
 import signal
 import sys

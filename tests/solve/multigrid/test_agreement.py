@@ -24,7 +24,7 @@ CASES = {
 }
 
 
-# each case takes some ten seconds
+# each case takes about ten seconds
 QUICK = {"touching"}
 
 
@@ -33,7 +33,7 @@ QUICK = {"touching"}
     [case if case in QUICK else pytest.param(case, marks=pytest.mark.slow) for case in CASES],
 )
 def test_frames_are_those_by_jacobi(petsc_options, tmp_path: Path, case: str):
-    """With several coarse levels. Errors of N steps add up to N (N + 1) / 2 of the greatest."""
+    """Frames agree with several coarse levels; errors of N steps sum to N (N + 1) / 2 errors."""
     base = {
         "sides": np.array([8, 3, 3]) * CELL,
         "material": SOFT,

@@ -1,4 +1,4 @@
-"""The Cholesky factor of the coarsest level, beside dense solves."""
+"""The Cholesky factor of the coarsest level agrees with dense solves."""
 
 import numpy as np
 from petsc4py import PETSc
@@ -7,7 +7,7 @@ from msmpetsc.solve.multigrid.block_cholesky import BlockCholesky
 
 
 def test_solves_are_those_of_a_dense_matrix_also_with_other_nonzeros():
-    """A chain of light nodes, some of which a spring joins; in the second round others."""
+    """Solve for a chain of light nodes that springs join; in the second round at other nodes."""
     size, rng = 50, np.random.default_rng(3)
     pc = PETSc.PC().createPython(BlockCholesky(), comm=PETSc.COMM_SELF)
     for others in (20, 5):

@@ -1,6 +1,6 @@
 """The cycle is symmetric, positive definite, and at most the inverse of its own Hessian.
 
-CG on the true Hessian takes few iterations with it at any time step, and no more on a finer
+CG on the true Hessian takes few iterations with the cycle at any time step, and not more on a finer
 lattice.
 """
 
@@ -9,7 +9,7 @@ import pytest
 from hierarchies import COMM, LATTICES, SHAPES, Case, at, block, build, figure, heavier, hierarchy
 from scipy.linalg import eigh
 
-# relative to the greatest number; single precision has 6e-8
+# relative to the greatest entry; single precision has 6e-8
 SYMMETRIC = 1e-6
 # effect of single precision on the greatest eigenvalue, 1
 BEYOND = 1e-5
@@ -22,8 +22,9 @@ def check(
 ) -> None:
     """Check that B is symmetric and B H has eigenvalues between ``least`` and 1.
 
-    Each part of B moves along a descent, not too far. If the lattice has rollers, only its moving
-    components count.
+    Each part of B moves along a descent, not too far.
+
+    moves : mask of the moving components of a lattice with rollers; only these count
     """
     b, h = case.cycle(), case.hessian()
     if moves is not None:
@@ -40,7 +41,7 @@ def check(
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("name", LATTICES)
 def test_cycles(name: str, shape: str, coarsest: int):
-    """Bodies that share a coarse node, though nothing joins them, have the least."""
+    """The least eigenvalue occurs if bodies share a coarse node although no spring joins them."""
     with hierarchy(COMM, build(COMM, LATTICES[name]), SHAPES[shape], coarsest=coarsest) as case:
         check(case, {"many bodies": 0.07, "two bodies in one coarse cell": 0.18}.get(name, 0.3))
 
@@ -48,7 +49,7 @@ def test_cycles(name: str, shape: str, coarsest: int):
 @pytest.mark.parametrize("coarsest", [pytest.param(800, marks=pytest.mark.slow), 10])
 @pytest.mark.parametrize("name", ["block", "limbs", "thin sheet", "a cell"])
 def test_cycles_of_solids_with_contact_and_pins(name: str, coarsest: int):
-    """For cells pressed to a fifth the cycle is weaker.
+    """If cells are pressed to a fifth, the cycle is weaker.
 
     Their curvature is along few directions, which the cycle cannot smooth.
     """
@@ -61,7 +62,7 @@ def test_cycles_of_solids_with_contact_and_pins(name: str, coarsest: int):
 @pytest.mark.parametrize("shape", ["twisted", "crushed"])
 @pytest.mark.parametrize("name", LATTICES)
 def test_cycles_of_light_and_heavy_bodies(name: str, shape: str, mass: float):
-    """A light free body moves as a whole as far as the raised diagonal allows, a 1e10th."""
+    """A light free body moves as a whole as far as the raised diagonal allows, by 1e-10."""
     pinned = heavier(build(COMM, LATTICES[name], pins=True), mass)
     with hierarchy(COMM, pinned, SHAPES[shape], coarsest=10) as case:
         loose = name in LOOSE and mass < 1
@@ -72,7 +73,7 @@ def test_cycles_of_light_and_heavy_bodies(name: str, shape: str, mass: float):
 @pytest.mark.parametrize("pins", [False, True])
 @pytest.mark.parametrize("name", ["block", "limbs", "thin sheet", "rod"])
 def test_cycles_of_two_materials(name: str, contrast: float, pins: bool):
-    """A single precision serves both: a part 1e6 times softer keeps about a digit."""
+    """A single precision serves both parts: the softer part, by 1e6, keeps about a digit."""
     with hierarchy(
         COMM, build(COMM, LATTICES[name], contrast=contrast, pins=pins), SHAPES["twisted"]
     ) as case:
@@ -96,8 +97,8 @@ def test_one_free_node():
 def test_cycles_of_bodies_on_rollers(name: str, shape: str):
     """Planes of symmetry at both ends of an axis, and all nodes between two walls.
 
-    No worse than without, except for 1 / GROUND of each coarse component, which the springs to the
-    ground leave.
+    The cycle is as good as without rollers, up to 1 / GROUND of each coarse component, because of
+    the springs to the ground.
     """
     lattice = build(COMM, LATTICES[name])
     low, high = lattice.nodes.min(axis=0) + 0.01, lattice.nodes.max(axis=0) - 0.01
@@ -112,7 +113,7 @@ def test_cycles_of_bodies_on_rollers(name: str, shape: str):
 @pytest.mark.parametrize("density", [1e-3, 1e3])
 @pytest.mark.parametrize("shape", SHAPES)
 def test_a_sheet_with_its_underside_held(density: float, shape: str):
-    """Its free nodes lie halfway between layers of coarse nodes.
+    """Free nodes lie halfway between layers of coarse nodes.
 
     So P^T H P is singular without the raised diagonal.
     """
@@ -129,22 +130,22 @@ def test_a_sheet_with_its_underside_held(density: float, shape: str):
 TOLERANCE = 3e-2
 # time steps [s], from nearly decoupled nodes to statics
 STEPS = [1e-4, 1e-3, 1e-2, 1 / 60, 1e-1, 1.0]
-# cells at a fineness, whether pinned, the fineness
+# cells at a fineness, whether they are pinned, and the fineness
 NAMED = {
     "clamped beam": (lambda n: block(10 * n, 2 * n, 2 * n), True, (1, 2, 4)),
     "block": (lambda n: block(3 * n, 3 * n, 3 * n), False, (1, 2, 4)),
     "clamped sheet": (lambda n: block(10 * n, 10 * n, 1), True, (1, 2, 4)),
     "figure": (figure, False, (1, 2)),
 }
-# most iterations, with a margin of 1; the legs of the figure share coarse nodes, as a
-# single cell lies between them
+# most iterations, with a margin of 1; the legs of the figure share coarse nodes, as
+# only one cell lies between them
 MOST = {"clamped beam": 3, "block": 3, "clamped sheet": 4, "figure": 9}
 # most additional iterations from the coarsest lattice to the finest
 GROWTH = 1
 
 
 def counts(name: str, fineness: int, shape: str) -> np.ndarray:
-    """Iterations (steps, 2): under weight, and of rough pushes."""
+    """Return the iterations (steps, 2) under weight, and with rough pushes."""
     cells, pins, _ = NAMED[name]
     lattice, found = build(COMM, cells(fineness), pins=pins), []
     for step in STEPS:
@@ -173,8 +174,10 @@ AT_REST = {None: 3, 0.25: 3, 0.45: 4, 0.49: 8, 0.499: 20}
 
 @pytest.mark.parametrize("poisson", AT_REST)
 def test_few_iterations_of_a_slender_body_at_rest(poisson: float | None):
-    """Coarse diagonals that are raised by 1e-5 hold it to the ground: 5, 5, 8, 18 and 59
-    iterations."""
+    """With coarse diagonals raised by 1e-5 the body takes 5, 5, 8, 18 and 59 iterations.
+
+    They act as springs to the ground.
+    """
     with hierarchy(
         COMM, build(COMM, BENT, pins=True, poisson=poisson), SHAPES["rest"], STATIC
     ) as case:

@@ -1,5 +1,4 @@
-"""Coarse matrices are P^T H P, H the projected Hessian as its products have it, whatever the
-lattice has."""
+"""Coarse matrices are P^T H P with the projected Hessian H, for lattices of all kinds."""
 
 import numpy as np
 import pytest
@@ -8,7 +7,7 @@ from lattices import block
 
 from msmpetsc.solve.multigrid.coarse_products import CoarseOperator
 
-# lattice, shape, contact, more
+# lattice, shape, contact, further arguments
 CASES = {
     "pinned": ("block", "twisted", False, {"pins": True}),
     "crushed": ("block that begins at odd indices", "crushed", False, {}),
@@ -28,14 +27,14 @@ CASES = {
 
 
 def raised(matrix: np.ndarray, case: Case) -> np.ndarray:
-    """Its diagonal, by more where a body is free."""
+    """Return a matrix with its diagonal raised, more if a body is free."""
     return matrix + (1e-5 if case.multigrid.bodies.free.any() else 1e-8) * np.diag(
         matrix.diagonal()
     )
 
 
 def assert_close(found: np.ndarray, expected: np.ndarray, accuracy: float = 1e-12) -> None:
-    """Assert equality relative to the nodes' own entries, since a soft part joins a stiff part."""
+    """Assert equality relative to the nodes' own entries, since soft and stiff parts are joined."""
     size = np.sqrt(expected.diagonal())
     np.testing.assert_allclose(
         found / np.outer(size, size), expected / np.outer(size, size), rtol=0, atol=accuracy
@@ -54,8 +53,7 @@ def check_levels(case: Case) -> None:
 
 
 def check_operator(coarse: CoarseOperator, matrix: np.ndarray) -> None:
-    """It is the matrix in single precision, and symmetric; a translation keeps its digits whatever
-    the stiffness."""
+    """Check that the operator is the matrix in single precision, also for translations."""
     x, found = coarse.operator.createVecs()
     noise = np.random.default_rng(1).standard_normal(x.getLocalSize())
     translation = np.tile([1.0, 2.0, 3.0], len(noise) // 3)
@@ -68,7 +66,7 @@ def check_operator(coarse: CoarseOperator, matrix: np.ndarray) -> None:
 
 @pytest.mark.parametrize("seed", [0, 3, 4, 5])
 def test_levels_of_random_lattices_are_galerkin_products(seed: int):
-    """Pinned nodes hold several parts, each with copies of coarse nodes of its own."""
+    """Pinned nodes belong to several parts, each with its own copies of coarse nodes."""
     rng = np.random.default_rng(seed)
     cells = block(7, 7, 7)
     lattice = build(COMM, cells[rng.random(len(cells)) < 0.3])
@@ -79,7 +77,7 @@ def test_levels_of_random_lattices_are_galerkin_products(seed: int):
 
 @pytest.mark.parametrize("name", CASES)
 def test_levels_are_galerkin_products(name: str):
-    """And positive definite, at whatever positions."""
+    """Coarse matrices are positive definite at any positions."""
     lattice, shape, contact, more = CASES[name]
     with hierarchy(
         COMM, build(COMM, LATTICES[lattice], **more), SHAPES[shape], contact=contact, coarsest=10
@@ -102,7 +100,7 @@ def test_levels_of_light_and_heavy_bodies(name: str, mass: float):
 
 
 def test_a_new_hierarchy_takes_nothing_of_the_old_one():
-    """Neither positions, nor contact, nor old entries of the matrices."""
+    """A new hierarchy takes over neither positions, nor contact, nor entries of matrices."""
     with hierarchy(
         COMM,
         build(COMM, LATTICES["limbs"], pins=True),
@@ -122,7 +120,7 @@ def test_a_new_hierarchy_takes_nothing_of_the_old_one():
 
 
 def test_a_hierarchy_says_what_its_levels_are():
-    """Nonzeros of the finest level, which is never assembled, are those of its dense matrix."""
+    """The nonzeros told for the finest level, never assembled, are those of its dense matrix."""
     lattice = build(COMM, LATTICES["block"], pins=True)
     with hierarchy(COMM, lattice, SHAPES["twisted"], coarsest=10) as case:
         blocks = case.hessian().reshape(-1, 3, len(case.hessian()) // 3, 3)

@@ -1,4 +1,4 @@
-"""The coarse grids, and how values pass between them."""
+"""The coarse grids, and interpolation between them."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from msmpetsc.solve.multigrid.grids import grids
 @pytest.mark.parametrize("pins", [False, True])
 @pytest.mark.parametrize("name", LATTICES)
 def test_interpolation_reproduces_what_is_linear(name: str, pins: bool):
-    """On every level; a constant among it: the weights of a node sum to 1."""
+    """Each level reproduces linear functions and constants, so the weights of a node sum to 1."""
     slopes, at_origin = np.array([[2.0, -3, 5], [0.5, 7, 1], [-1, 1, 4]]), np.array([11.0, -2, 3])
     with hierarchy(COMM, build(COMM, LATTICES[name], pins=pins), coarsest=2) as case:
         nodes, free = case.lattice.nodes, case.unknowns.free
@@ -58,7 +58,7 @@ def test_grids_have_the_neighbours_of_half_an_index_until_one_is_small(
 
 
 def test_a_grid_that_is_not_much_smaller_is_none():
-    """Bodies far from each other: each keeps its corners, however coarse the grid."""
+    """Bodies far from each other keep all their corners on any coarse grid."""
     lattice = build(COMM, 64 * np.argwhere(np.ones((3, 3, 3))))
     keys = lattice.table.keys
     copies = CoarseCopies(lattice, keys, np.zeros_like(keys))
@@ -70,7 +70,7 @@ def test_a_grid_that_is_not_much_smaller_is_none():
 
 @pytest.mark.parametrize("name", LATTICES)
 def test_no_coarse_node_spans_a_gap(name: str):
-    """The fine nodes of each coarse node hang together by cells."""
+    """Cells connect the fine nodes of each coarse node."""
     with hierarchy(COMM, build(COMM, LATTICES[name])) as case:
         p = case.interpolation(0)[::3, ::3] > 0
         cells = csr_array(
@@ -87,7 +87,7 @@ def test_no_coarse_node_spans_a_gap(name: str):
 
 @pytest.mark.parametrize("gap", [1, 2, 3, 4, 6])
 def test_gaps_cost_no_iterations(gap: int):
-    """Two prongs clamped at their root; joined by coarse grids they took four times as many."""
+    """If coarse grids join two prongs clamped at their root, iterations quadruple."""
     prong = block(40, 5, 5)
     fork = np.concatenate([prong, at(prong, 0, 5 + gap, 0), block(1, 10 + gap, 5)])
     with hierarchy(COMM, build(COMM, np.unique(fork, axis=0), pins=True), time_step=1e3) as case:
@@ -98,6 +98,6 @@ def test_gaps_cost_no_iterations(gap: int):
 
 
 def test_hierarchies_of_several_ranks_are_those_of_one():
-    """Numbers of coarse nodes, P, all levels' matrices and the cycle itself."""
+    """Compare numbers of coarse nodes, P, the matrices of all levels, and the cycle itself."""
     done = run(3, WORKERS / "multigrid_worker.py")
     assert done.returncode == 0 and done.stdout.count("same") == 3, done.stdout + done.stderr

@@ -1,5 +1,4 @@
-"""Contact of the surface with itself in multigrid's cycle: Woodbury's formula, and steps that it
-leads to."""
+"""Self-contact in multigrid's cycle: Woodbury's formula, and the steps that use it."""
 
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,8 +20,7 @@ POINTS, NODES, T2 = 7, 12, 1e-3
 
 @pytest.fixture
 def surface() -> SurfaceHessian:
-    """Three stiff pairs of points, each of which five nodes carry; the last pair is the stiffest by
-    far."""
+    """Return three stiff pairs of points of five nodes each; the last pair is the stiffest."""
     rng = np.random.default_rng(5)
     weights = np.where(rng.random((POINTS, NODES)) < 0.4, rng.normal(size=(POINTS, NODES)), 0.0)
     points = np.zeros((3 * POINTS, 3 * POINTS))
@@ -35,13 +33,13 @@ def surface() -> SurfaceHessian:
 
 
 def joined(surface: SurfaceHessian) -> np.ndarray:
-    """C = t^2 W^T H_c W (3n, 3n), columns x, y, z of a node together."""
+    """Return C = t^2 W^T H_c W (3n, 3n), with the columns x, y, z of a node together."""
     w = np.kron(surface.weights.toarray(), np.eye(3))
     return T2 * w.T @ surface.points.toarray() @ w
 
 
 def test_the_smoother_inverts_blocks_and_contact_together(surface: SurfaceHessian):
-    """Its eigenvalues are 1, though contact is 1e9 times as stiff as the blocks."""
+    """All eigenvalues are 1, although contact is 1e9 times as stiff as the blocks."""
     rng = np.random.default_rng(6)
     roots = rng.normal(size=(NODES, 3, 3))
     inverse = roots @ roots.transpose(0, 2, 1) + np.eye(3)
@@ -62,7 +60,7 @@ def test_the_smoother_inverts_blocks_and_contact_together(surface: SurfaceHessia
 def test_the_stiff_points_and_the_others_are_the_whole_less_what_joins_both(
     surface: SurfaceHessian,
 ):
-    """A point is stiff if it gives way less than its nodes allow: here a point of the last pair."""
+    """A point is stiff if its contact yields less than its nodes, as in the last pair."""
     compliance = np.full(NODES, 1e-8)
     stiff, others = surface.split(compliance, POINTS)
     assert stiff is not None and others is not None and stiff.points.shape == (6, 6)
@@ -70,7 +68,7 @@ def test_the_stiff_points_and_the_others_are_the_whole_less_what_joins_both(
         joined(stiff) + joined(others), joined(surface), atol=1e-12 * np.abs(joined(surface)).max()
     )
     assert np.abs(joined(stiff)).max() > 1e3 * np.abs(joined(others)).max()
-    # the stiffest contact alone
+    # only the stiffest contact
     one, rest = surface.split(compliance, 1)
     assert (
         one is not None
@@ -84,7 +82,7 @@ def test_the_stiff_points_and_the_others_are_the_whole_less_what_joins_both(
 def test_the_coarsest_matrix_has_the_whole_contact_and_finer_levels_their_blocks(
     surface: SurfaceHessian,
 ):
-    """Beside P^T C P by dense matrices, twice: the second contact replaces the first."""
+    """Matrices equal P^T C P by dense products; a second contact replaces the first."""
     rng = np.random.default_rng(7)
     p = [rng.random((NODES, 6)), rng.random((6, 4))]
     without = PETSc.Mat().createAIJ((12, 12), bsize=3, comm=MPI.COMM_SELF)
@@ -113,8 +111,11 @@ SOLID = solid_of(1e5)
 def test_contact_that_joins_nodes_takes_a_part_of_the_iterations_to_the_same_frames(
     tmp_path: Path, monkeypatch
 ):
-    """In its second step, to 1e-12; the first joins no nodes, the third comes to either of two
-    minima. Rounding changes the counts by a tenth, so they are of three moduli."""
+    """With joined nodes the second step in contact takes fewer iterations to 1e-12.
+
+    The first step joins no nodes, and the third ends in either of two minima. Rounding changes the
+    counts by a tenth, so they are summed over three moduli.
+    """
     its = {0: 0, cycle.POINTS: 0}
     for change in (0, 1e-13, -1e-13):
         positions = []

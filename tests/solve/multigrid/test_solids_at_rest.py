@@ -1,6 +1,6 @@
 """Iterations of CG with multigrid, to newton's tolerance, for solids at rest by Poisson's ratio.
 
-Bodies are whole cells, and scans that the grid cuts. With -s it prints the table of
+The bodies are whole cells, and scans that the grid cuts. With -s it prints the table of
 scripts/results/multigrid.md.
 """
 
@@ -30,7 +30,7 @@ WANTED = {"beam": WHOLE, "long beam": WHOLE, "bunny": CUT, "rod": CUT}
 
 
 def body(name: str) -> tuple[trimesh.Trimesh, dict]:
-    """Return the surface of a body that z = 0 cuts, and its cells."""
+    """Return the surface of a body that the plane z = 0 cuts, and its cells."""
     if name == "bunny":
         try:
             return study.bunny(), {"count": 10_000}

@@ -23,12 +23,12 @@ out.mkdir(parents=True, exist_ok=True)
 # ## The scene
 #
 # `heart_vessels` is a mesh that `msmpetsc fetch --list` knows; it is fetched at the
-# first use. A path of your own mesh may stand in its place. The mesh lies on its back,
+# first use. You may give the path of your own mesh instead. The mesh lies on its back,
 # so `prepare` turns it. A mesh from a segmentation may need `merge`, `largest_part` or
 # `repair` first ([your own mesh](../get-started/own-mesh.md)).
 #
 # Tissue is nearly incompressible, hence Poisson's ratio 0.47. The vessels are pinned.
-# The tip of the chambers is led down by 15 mm in three static states.
+# The tip of the chambers moves down by 15 mm in three static states.
 
 # %%
 vessels = {"half_space": {"point": [0, 0, 0.82], "normal": [0, 0, 1]}, "relative": True}
@@ -52,8 +52,8 @@ path = msm.run(scene, out / "heart.h5", overwrite=True, quiet=True)
 # %% [markdown]
 # ## Force over displacement
 #
-# `reaction` has the force of each pin and then of each anchor on the body. The anchor
-# is the second.
+# `reaction` has the force on the body of each pin and then of each anchor. The anchor
+# has index 1.
 
 # %%
 with msm.open(path) as result:
@@ -78,8 +78,8 @@ for displacement, pull in zip(0.015 * time / 3.0, force, strict=True):
 #
 # ## Stress and volume
 #
-# A material of Poisson's ratio 0.47 changes its volume little. That checks cells and
-# law at once.
+# A material of Poisson's ratio 0.47 changes its volume little. So the change of volume
+# checks cells and law at once.
 
 # %%
 volumes = [trimesh.Trimesh(points, triangles, process=False).volume for points in surface]
@@ -100,7 +100,7 @@ words = ["render", path, "-o", out / "heart.png", "--colour", "stress", "--count
 subprocess.run([sys.executable, "-m", "msmpetsc", *map(str, words)], check=True)
 
 # %% [markdown]
-# ![Von Mises' stress of a heart whose tip is led down](heart.png)
+# ![Von Mises' stress of a heart whose tip is moved down](heart.png)
 #
 # `out/tutorial/heart.png` shows the rest shape and two states.
 # `out/tutorial/heart.xdmf` opens in ParaView with the stresses.

@@ -2,8 +2,8 @@
 # # A solver study, read by pandas
 #
 # Which preset reaches which error of a step at least cost? A study runs the cases,
-# pandas reads its table. The tutorial takes a minute or two on a single core and needs
-# the extras `run` and `study`: [solvers.py](solvers.py).
+# and pandas reads its table. The tutorial takes a minute or two on a single core and
+# needs the extras `run` and `study`: [solvers.py](solvers.py).
 
 # %%
 import subprocess
@@ -82,9 +82,9 @@ print(cost.to_string(float_format="{:.0f}".format))
 #     0.010        115    114      13
 #     0.100        103    103      11
 #
-# Each preset keeps the error that was asked for. `anderson` and `lbfgs` never apply
-# the Hessian: they need more iterations for each digit than `newton`, whose
-# convergence is quadratic.
+# Each preset meets the error asked for. The iterations of `anderson` and `lbfgs` do
+# not use the Hessian, so they need more iterations for each digit than `newton`,
+# whose convergence is quadratic.
 
 # %%
 assert (table.true_error <= table.error).all(), "each step should meet its error"
@@ -92,5 +92,5 @@ growth = cost.loc[1e-3].sub(cost.loc[1e-1])
 assert growth.idxmin() == "newton", "digits should cost newton least"
 
 # %% [markdown]
-# `out/solvers/report.html` has the charts. The shipped studies ask the same on larger
-# scenes: [their results](../../../results/studies.md).
+# `out/solvers/report.html` has the charts. The shipped studies compare
+# presets on larger scenes: [their results](../../../results/studies.md).

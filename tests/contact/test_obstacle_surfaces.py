@@ -286,3 +286,23 @@ def test_a_ball_whose_nodes_have_no_triangle_around_is_built(tmp_path: Path):
         obstacle=[FLOOR],
     )
     assert len(model_of(scene).lattice.cells) == 72
+
+
+def test_balls_of_a_micrometre_have_the_triangles_of_balls_of_a_metre(tmp_path: Path):
+    """No absolute length merges points of an obstacle."""
+    counts = []
+    for scale in (1.0, 1e-6):
+        ball = trimesh.creation.icosphere(subdivisions=2, radius=0.15 * scale)
+        ball.export(tmp_path / "scene.ply")
+        below = {"shape": "sphere", "center": [0, 0, -0.31 * scale], "radius": 0.15 * scale}
+        scene = write_scene(
+            tmp_path,
+            mesh={"source": "scene.ply"},
+            cages={"count": 71},
+            material=SOLID,
+            time={"step": 0.01, "duration": 0.01},
+            obstacle=[below | {"response": "barrier"}],
+        )
+        (obstacle,) = surfaces(model_of(scene)).solids
+        counts.append((len(obstacle.points), len(obstacle.triangles)))
+    assert counts[0] == counts[1]

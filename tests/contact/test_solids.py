@@ -102,6 +102,28 @@ def test_normals_are_the_slope_of_depths_and_a_small_change_keeps_its_digits(sol
     )
 
 
+@pytest.mark.parametrize("radius", [1e-2, 1e-6])
+def test_fine_triangles_have_the_depths_of_large_triangles(radius: float):
+    """Triangles of 0.4 mm, in a ball of 1 cm, and of 0.04 um."""
+    mesh = trimesh.creation.icosphere(5)
+    large, small = solid_of(mesh), solid_of(mesh.copy().apply_scale(radius))
+    rng = np.random.default_rng(3)
+    x = rng.normal(size=(500, 3))
+    x *= rng.uniform(0.95, 0.98, (500, 1)) / np.linalg.norm(x, axis=1)[:, None]
+    depths, face = large.depths(x)
+    found, found_face = small.depths(radius * x)
+    np.testing.assert_allclose(found, radius * depths, rtol=1e-9)
+    moved = radius * 1e-3 * rng.normal(size=x.shape)
+    np.testing.assert_allclose(
+        small.normals(radius * x, found_face), large.normals(x, face), atol=1e-9
+    )
+    np.testing.assert_allclose(
+        small.depth_change(radius * x, moved, face),
+        radius * large.depth_change(x, moved / radius, face),
+        atol=1e-12 * radius,
+    )
+
+
 def test_a_node_on_the_surface_has_its_triangles_normal_and_one_far_off_no_depth():
     cube = solid_of(trimesh.creation.box((1, 1, 1)))
     on_top, far = np.array([[0.1, 0.2, 0.5]]), np.array([[9.0, 0, 0]])

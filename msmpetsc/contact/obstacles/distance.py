@@ -131,8 +131,13 @@ class MeshSolid(DistanceSolid):
         # A scene without mesh obstacles starts without igl.
         import igl
 
-        mesh = trimesh.Trimesh(surface.points, surface.triangles, process=True, validate=True)
-        self.points = np.ascontiguousarray(mesh.vertices, float)
+        # trimesh's tolerances are absolute: scale the mesh to a size of about 1 by a
+        # power of two, which rounds nothing
+        size = 2.0 ** np.ceil(np.log2(np.ptp(surface.points, axis=0).max()))
+        mesh = trimesh.Trimesh(
+            surface.points / size, surface.triangles, process=True, validate=True
+        )
+        self.points = np.ascontiguousarray(mesh.vertices * size, float)
         self.triangles = np.ascontiguousarray(mesh.faces, np.int64)
         self._normals, self._of_corners = np.array(mesh.face_normals), np.array(mesh.vertex_normals)
         normals, _, of_edge = igl.per_edge_normals(
@@ -142,7 +147,7 @@ class MeshSolid(DistanceSolid):
         )
         # For each triangle the normals of the edges opposite to its corners.
         self._of_edges = normals[of_edge].reshape(3, -1, 3).swapaxes(0, 1)
-        self._bounds = np.array(mesh.bounds)
+        self._bounds = mesh.bounds * size
         tree = igl.AABB()
         tree.init(self.points, self.triangles)
         self._trees = [tree]
@@ -167,7 +172,11 @@ class MeshSolid(DistanceSolid):
         return depths, face
 
     def _behind(self, q: Positions, face: Indices) -> tuple[Floats, Rows]:
-        out = closest_point(self.points[self.triangles[face]], q) - q  # type: ignore[no-untyped-call]
+        corners = self.points[self.triangles[face]]
+        # scale each triangle to a size of about 1 for trimesh's tolerances
+        size = np.ptp(corners, axis=1).max(axis=1)[:, None]
+        unit, at = (corners - corners[:, :1]) / size[:, None], (q - corners[:, 0]) / size
+        out = (closest_point(unit, at) - at) * size  # type: ignore[no-untyped-call]
         depth = np.linalg.norm(out, axis=1)
         on_surface = depth <= ROUNDED * np.abs(self._bounds).max()
         normals = out / np.maximum(depth, TINY)[:, None]

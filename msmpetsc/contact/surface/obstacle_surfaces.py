@@ -10,6 +10,7 @@ import trimesh
 from msmpetsc.backend.arrays import Floats, Positions, Rows
 from msmpetsc.contact.obstacles.distance import DistanceSolid
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
+from msmpetsc.geometry.prepare import merge
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.scene.obstacles import BARRIER, ObstacleTable
 from msmpetsc.scene.reading import Scene
@@ -170,5 +171,4 @@ def _split(surface: Surface, longest: float) -> Surface:
         halves = np.transpose([[a, middle, c], [middle, b, c]], (0, 2, 1)).reshape(-1, 3)
         triangles = np.concatenate([triangles[~long], halves])
     # Merge the middles of edges that were halved from both sides
-    whole = trimesh.Trimesh(points, triangles)
-    return Surface(np.array(whole.vertices, float), np.array(whole.faces, np.int64))
+    return merge(Surface(points, triangles))

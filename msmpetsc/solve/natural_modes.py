@@ -61,7 +61,7 @@ def modes_of(comm: MPI.Intracomm, scene: Scene, model: Model, count: int) -> Mod
     """Return the lowest ``count`` modes of a scene's bodies (collective).
 
     The state is the last equilibrium of a static scene, the state that ``start.from`` names, or
-    the rest shape.
+    the rest shape. Pressures follow the surface, so they have stiffness, except at rest.
 
     Raises InputError if the bodies have fewer modes, and StepFailed if no state or mode is found.
     """
@@ -74,8 +74,11 @@ def modes_of(comm: MPI.Intracomm, scene: Scene, model: Model, count: int) -> Mod
             return _about(loop.environment, loop.state.q, loop.integrator.problem, time, count)
     is_given = any(start and start.from_ for start in scene.starts)
     q = model.start[0] if is_given else model.lattice.nodes
+    environment = Environment(model)
     problem = StepProblem(q, q, np.zeros((model.lattice.owned, 3)))
-    return _about(Environment(model), q, problem, 0.0, count)
+    if is_given:
+        problem = replace(problem, pressures=environment.forces.at(0.0).pressures.values)
+    return _about(environment, q, problem, 0.0, count)
 
 
 def _about(

@@ -191,7 +191,8 @@ def test_a_ball_pressed_into_a_hole_stays_on_its_rim(
 def test_a_block_that_turns_with_a_table_slips_by_nothing_in_a_step_of_bdf2(tmp_path: Path):
     """The slip of a block that turns with a table is zero.
 
-    With the table's velocity at the middle of the step, blocks crept by w^2 r t / 2.
+    With the table's velocity at the middle of the step, blocks crept by w^2 r t / 2, and the work
+    of the table took (w t)^2 of the block's energy a step.
     """
     t = 0.01
     table = box_at([[-1, -1, -0.2], [1, 1, -2e-4]], response="barrier", center=[0, 0, 0])
@@ -204,10 +205,15 @@ def test_a_block_that_turns_with_a_table_slips_by_nothing_in_a_step_of_bdf2(tmp_
         return Rotation.from_rotvec([0, 0, 2 * np.pi * time]).apply(model.lattice.nodes)
 
     contacts = ContactSearch(CandidateCache(MPI.COMM_SELF, model.collision), t, 2 * t)
-    friction = SurfaceContact(contacts, turned(t), t, turned(0)).friction
+    contact = SurfaceContact(contacts, turned(t), t, turned(0))
+    friction = contact.friction
     assert friction is not None and len(friction.pairs) > 10
     slip = friction.slip(contacts.points_at(turned(2 * t), 2 * t))[0]
     np.testing.assert_allclose(slip, 0, atol=1e-14)
+    # Friction of blocks that slip outwards is across the velocity of the table.
+    slipped = turned(2 * t) * [1 + 1e-4, 1 + 1e-4, 1]
+    (force,), work = contact.of_obstacles(slipped)
+    assert abs(work) < 2e-3 * np.linalg.norm(force[:2]) * 2 * np.pi * t
 
 
 def error_of_a_slide(folder: Path, t: float) -> float:

@@ -107,6 +107,20 @@ def test_modes_of_a_loaded_body_are_those_of_its_state(tmp_path: Path):
     assert np.abs(modes(at_rest, 6).frequencies / expected - 1).max() > 0.01
 
 
+def test_a_pressure_has_the_stiffness_of_an_equilibrium_about_its_state_from_a_file(tmp_path: Path):
+    """Without it the compressed bar seemed to buckle."""
+    region = {"box": [[-1, -1, -1], [2, 2, 2]]}
+    loaded = {"pin": CLAMP, "pressure": [{"region": region, "value": 0.2 * YOUNG}]}
+    path = body(tmp_path, [1, 0.25, 0.25], 0.125, **loaded, time={"integrator": "static"})
+    expected = modes(path, 4).frequencies
+    assert expected[0] > 0
+    with result_on(1, path):
+        other = body(
+            tmp_path, [1, 0.25, 0.25], 0.125, **loaded, start={"from": "scene_1.h5"}, name="other"
+        )
+    np.testing.assert_allclose(modes(other, 4).frequencies, expected, rtol=1e-5)
+
+
 def test_an_obstacle_that_is_pressed_holds_the_tip(tmp_path: Path):
     """A support near the free end raises the lowest bending frequency of a clamped bar.
 

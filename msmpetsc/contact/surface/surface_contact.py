@@ -97,6 +97,7 @@ class SurfaceContact:
                    friction; None for the normal forces at the start
     before       : contact in the last step
     has_friction : whether there is friction
+    has_history  : whether ``last`` is given
     friction     : friction in the step, on rank 0
     """
 
@@ -110,7 +111,7 @@ class SurfaceContact:
         before: "SurfaceContact | None" = None,
     ):
         self.contacts, self.comm = contacts, contacts.comm
-        self.has_friction = False
+        self.has_friction, self.has_history = False, last is not None
         self.friction: SurfaceFriction | None = None
         # The last Hessians, projected or not
         self._hessians: dict[bool, tuple[SurfaceContactsAt, Rows | None, SurfaceHessian]] = {}
@@ -256,18 +257,24 @@ class SurfaceContact:
     def of_obstacles(self, q: Positions, frame: Floats | float = 0.0) -> tuple[Rows, float]:
         """Return obstacles' forces (k, 3) [N] on the bodies, and their work [J] in the step to q.
 
-        The work is of the force at the end of the step: an upper bound for a convex energy.
+        The work is of the force at the end of the step: an upper bound for a convex energy. In a
+        step of BDF2 the obstacles have their velocity at its end, as in friction. If an obstacle
+        turns at w, its displacement in the step makes an angle w t / 2 with this velocity.
 
         frame : (3,) displacement of the frame [m] in which the work is counted
         """
         moment = self._acting(q)
         points, obstacles = self.contacts.points, self.contacts.obstacles
+        step = self.contacts.begin, self.contacts.time
         forces_and_work = np.zeros((len(obstacles.numbers), 3)), 0.0
         if obstacles.total and moment is not None:
             if len(moment.points):
                 forces = self._gradient(moment)[points.bodies :]
-                moved = obstacles.displacements(self.contacts.begin, self.contacts.time) - frame
-                forces_and_work = obstacles.sums(forces), float((forces * moved).sum())
+                moved = obstacles.displacements(*step)
+                if self.has_history:
+                    moved = 1.5 * moved - 0.5 * obstacles.displacements_before(*step)
+                work = float((forces * (moved - frame)).sum())
+                forces_and_work = obstacles.sums(forces), work
             forces_and_work = self.comm.bcast(forces_and_work)
         return forces_and_work
 

@@ -17,6 +17,7 @@ from argparse import RawDescriptionHelpFormatter
 from contextlib import suppress
 from importlib import import_module
 from itertools import pairwise
+from types import ModuleType
 from typing import Any, NoReturn
 
 import msmpetsc
@@ -78,12 +79,28 @@ def carry_out(args: argparse.Namespace, ranks: int) -> int:
     command = COMMANDS[args.command]
     if ranks > 1 and args.command not in ON_RANKS:
         raise InputError(f"{args.command} is for one process: start it without mpiexec")
+    module = _imported(f"msmpetsc.cli.commands.{command.module or args.command}")
     # SIGTERM then ends the runs that the command has started, as Ctrl-C does
     if command.starts_runs:
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-    module = import_module(f"msmpetsc.cli.commands.{command.module or args.command}")
     status: int = module.run(args)
     return status
+
+
+def _imported(name: str) -> ModuleType:
+    """Return an imported module; let a SIGINT that comes meanwhile act afterwards.
+
+    pydantic swallows an exception that a signal's handler raises while it builds a class.
+    """
+    interrupts: list[int] = []
+    before = signal.signal(signal.SIGINT, lambda number, _: interrupts.append(number))
+    try:
+        module = import_module(name)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if interrupts:
+        signal.raise_signal(signal.SIGINT)
+    return module
 
 
 def entry_point() -> None:

@@ -179,9 +179,9 @@ def write_one_frame(run: Result, frames: Sequence[int], path: Path) -> None:
     import meshio
 
     (frame,) = frames
-    meshio.write(
-        path, meshio.Mesh(run.surface_at(frame), [("triangle", run.indices("surface/triangles"))])
-    )
+    # PLY has no wider integers
+    triangles = run.indices("surface/triangles").astype(np.int32)
+    meshio.write(path, meshio.Mesh(run.surface_at(frame), [("triangle", triangles)]))
 
 
 # writers of the surface at frames, by the ending of the file

@@ -63,7 +63,7 @@ def velocity_field(start: Start, r: Rows) -> Rows:
     if start.gradient is not None:
         velocity += r @ np.array(start.gradient).T
     if start.swirl is not None:
-        a = np.array(start.swirl.axis) / np.linalg.norm(start.swirl.axis)
+        a = np.array(start.swirl.axis)
         rate = np.interp(r @ a, start.swirl.distances, start.swirl.rates)
         velocity += rate[:, None] * np.cross(a, r)
     return velocity
@@ -92,7 +92,7 @@ def twisted(q: Positions, twist: Twist, nodes: Positions, bounds: Rows) -> Posit
     The angle grows linearly along the axis with the rest positions ``nodes`` (n, 3). It is 0 at the
     beginning of the bounds and ``twist.degrees`` at their end.
     """
-    a = np.array(twist.axis) / np.linalg.norm(twist.axis)
+    a = np.array(twist.axis)
     middle = bounds.mean(axis=0)
     extent = np.abs(a) @ (bounds[1] - bounds[0])
     angle = np.radians(twist.degrees) * ((nodes - middle) @ a / extent + 0.5)[:, None]

@@ -8,7 +8,6 @@ from msmpetsc.scene.problems import rule
 from msmpetsc.scene.values import (
     Box,
     Count,
-    Direction,
     FileName,
     GroupName,
     ListOf,
@@ -29,7 +28,7 @@ PoissonRatio = Annotated[float, Field(ge=0, le=0.4999)]
 class Rotate(Table):
     """A rotation about the origin."""
 
-    axis: Direction = Field(description="rotation axis of any nonzero length [-]")
+    axis: UnitVector = Field(description="rotation axis of any nonzero length [-]")
     degrees: float = Field(description="angle, right-handed about the axis [degrees]")
 
 

@@ -9,7 +9,6 @@ from msmpetsc.scene.body import Region
 from msmpetsc.scene.problems import TAGS, rule
 from msmpetsc.scene.values import (
     Components,
-    Direction,
     FileName,
     FunctionName,
     ListOf,
@@ -17,6 +16,7 @@ from msmpetsc.scene.values import (
     NotNegative,
     Positive,
     Table,
+    UnitVector,
     Vector,
     after_start,
     refuse_unlike,
@@ -26,7 +26,7 @@ from msmpetsc.scene.values import (
 class Twist(Table):
     """A rotation that grows along an axis through the centre of the rest bounding box."""
 
-    axis: Direction = Field(description="twist axis of any nonzero length [-]")
+    axis: UnitVector = Field(description="twist axis of any nonzero length [-]")
     degrees: float = Field(
         lt=1e6,
         gt=-1e6,
@@ -38,7 +38,7 @@ class Twist(Table):
 class Swirl(Table):
     """An angular velocity about an axis, piecewise linear along it, constant beyond the table."""
 
-    axis: Direction = Field(description="axis through start.about, of any nonzero length [-]")
+    axis: UnitVector = Field(description="axis through start.about, of any nonzero length [-]")
     distances: ListOf[float] = Field(description="ascending distances along the axis [m]")
     rates: ListOf[float] = Field(
         description="angular velocity at each distance, right-handed about the axis [rad/s]"

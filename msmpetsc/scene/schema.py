@@ -13,13 +13,13 @@ from msmpetsc.scene.problems import Broken, KeyPath, rule
 from msmpetsc.scene.time import Time, one_state, unlike_the_integrator
 from msmpetsc.scene.values import (
     Count,
-    Direction,
     FileName,
     GroupName,
     ListOf,
     NotNegative,
     PresetName,
     Table,
+    UnitVector,
     Vector,
 )
 
@@ -183,7 +183,7 @@ class Output(Table):
 class Picture(Table):
     """View of the result in pictures."""
 
-    eye: Direction | None = Field(
+    eye: UnitVector | None = Field(
         None,
         description="direction from the body to the eye, of any nonzero length; across the body's "
         "longer side if absent [-]",

@@ -22,15 +22,11 @@ from pydantic_core import InitErrorDetails
 from msmpetsc.scene.problems import Broken, rule, unknown_key
 
 
-def _nonzero(vector: tuple[float, float, float]) -> tuple[float, float, float]:
+def _unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:
     if not any(vector):
         raise rule("must not be the zero vector")
-    return vector
-
-
-def _unit(vector: tuple[float, float, float]) -> tuple[float, float, float]:
     # divide by the largest component first, so that no square overflows or underflows
-    longest = max(map(abs, _nonzero(vector)))
+    longest = max(map(abs, vector))
     x, y, z = (c / longest for c in vector)
     length = math.hypot(x, y, z)
     return x / length, y / length, z / length
@@ -51,7 +47,6 @@ T = TypeVar("T")
 # not strict, because TOML has lists but no tuples
 ListOf = Annotated[tuple[T, ...], Strict(False)]
 Vector = Annotated[tuple[float, float, float], Strict(False)]
-Direction = Annotated[Vector, AfterValidator(_nonzero)]
 Components = Annotated[tuple[Literal["x", "y", "z"], ...], Strict(False), AfterValidator(_some)]
 UnitVector = Annotated[Vector, AfterValidator(_unit)]
 

@@ -67,4 +67,6 @@ def camera_facing(
 
 def unit(vector: ArrayLike) -> Floats:
     """Return a vector (3,) normalised to length 1."""
-    return np.divide(vector, np.linalg.norm(vector))
+    # divided by the largest component first, so that no square over- or underflows
+    scaled = np.divide(vector, np.abs(vector).max())
+    return np.divide(scaled, np.linalg.norm(scaled))

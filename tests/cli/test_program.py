@@ -6,6 +6,7 @@ import shlex
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from one_process import command_error, status_of
 
 import msmpetsc
 from msmpetsc.backend import kernel_cache
+from msmpetsc.cli import main as program
 from msmpetsc.cli.command_table import COMMANDS
 from msmpetsc.cli.commands import doctor
 from msmpetsc.cli.main import parsed
@@ -33,6 +35,18 @@ def test_every_command_has_examples_that_are_command_lines(capsys):
         assert all(f"\n  {example}\n" in shown for example in command.examples), (
             "the lines are kept whole"
         )
+
+
+def test_an_interrupt_is_not_lost_in_an_import(monkeypatch, capsys):
+    """Building a class swallows it, as pydantic does."""
+
+    def swallowing(_: str) -> None:
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(program, "import_module", swallowing)
+    assert program.main(["doctor"]) == 130
+    assert "interrupted" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

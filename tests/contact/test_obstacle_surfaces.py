@@ -191,8 +191,8 @@ def test_a_ball_pressed_into_a_hole_stays_on_its_rim(
 def test_a_block_that_turns_with_a_table_slips_by_nothing_in_a_step_of_bdf2(tmp_path: Path):
     """The slip of a block that turns with a table is zero.
 
-    With the table's velocity at the middle of the step, blocks crept by w^2 r t / 2, and the work
-    of the table took (w t)^2 of the block's energy a step.
+    With the table's velocity at the middle of the step, blocks crept by w^2 r t / 2. The work of
+    the table then took (w t)^2 of the block's energy a step.
     """
     t = 0.01
     table = box_at([[-1, -1, -0.2], [1, 1, -2e-4]], response="barrier", center=[0, 0, 0])

@@ -111,8 +111,9 @@ def test_normals_are_those_of_a_ball():
 
 
 @pytest.mark.parametrize("ending", [".obj", ".ply", ".stl"])
-def test_one_frame_of_the_surface(result: Path, tmp_path: Path, ending: str):
+def test_one_frame_of_the_surface(result: Path, tmp_path: Path, ending: str, capfd):
     mesh = trimesh.load(export(result, tmp_path / f"x{ending}"), process=False)
+    assert capfd.readouterr() == ("", "")
     assert np.allclose(mesh.triangles, surface(FRAMES - 1)[[[0, 1, 2], [1, 2, 3]]], atol=1e-6)
 
 

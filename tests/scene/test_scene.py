@@ -112,13 +112,22 @@ def test_line_ends_and_byte_order_mark_of_windows_editors(tmp_path):
 
 @given(st.tuples(*3 * [st.floats(allow_nan=False, allow_infinity=False)]).filter(any))
 @settings(max_examples=50, deadline=None)
-def test_normals_are_unit_vectors_at_any_magnitude(normal):
-    override = f"obstacle=[{{shape='plane', point=[0,0,0], normal={list(normal)}}}]"
+def test_directions_are_unit_vectors_at_any_magnitude(given):
+    overrides = (
+        f"obstacle=[{{shape='plane', point=[0,0,0], normal={list(given)}}}]",
+        f"picture.eye={list(given)}",
+        f"start.twist={{axis={list(given)}, degrees=9}}",
+        f"start.swirl={{axis={list(given)}, distances=[0, 1], rates=[0, 1]}}",
+        f"mesh.prepare=[{{rotate={{axis={list(given)}, degrees=9}}}}]",
+    )
     with tempfile.TemporaryDirectory() as folder:
-        scene = load(Path(folder), SMALLEST, override)
-    assert math.hypot(*scene.obstacle[0].normal) == pytest.approx(1, abs=1e-15)
-    longest = max(range(3), key=lambda i: abs(normal[i]))
-    assert scene.obstacle[0].normal[longest] * normal[longest] > 0
+        scene = load(Path(folder), SMALLEST, *overrides)
+    rotation = scene.mesh.prepare[0]["rotate"]["axis"]
+    axes = scene.start.twist.axis, scene.start.swirl.axis, rotation
+    for direction in (scene.obstacle[0].normal, scene.picture.eye, *axes):
+        assert math.hypot(*direction) == pytest.approx(1, abs=1e-15)
+        longest = max(range(3), key=lambda i: abs(given[i]))
+        assert direction[longest] * given[longest] > 0
 
 
 def test_every_key_is_described_with_its_unit():

@@ -85,6 +85,13 @@ def test_camera_stands_upright_and_at_the_eye(gravity, eye):
         assert camera.to_eye @ eye == pytest.approx(np.linalg.norm(eye))
 
 
+@pytest.mark.parametrize("scale", [1e-300, 1e300])
+def test_a_camera_takes_directions_of_any_length(scale):
+    one = camera_facing(POINTS, (0, 0, -1), (1, -2, 0.6))
+    other = camera_facing(POINTS, (0, 0, -scale), (scale, -2 * scale, 0.6 * scale))
+    assert other.to_eye == pytest.approx(one.to_eye) and other.up == pytest.approx(one.up)
+
+
 def test_the_longer_side_lies_across():
     assert abs(camera_facing(POINTS, None).right @ [0, 1, 0]) == pytest.approx(np.cos(YAW))
     assert abs(camera_facing(POINTS, None, (0, 0, 2)).right @ [0, 1, 0]) == pytest.approx(1)

@@ -151,7 +151,8 @@ class EnergyBalance:
 
         Energy and work are counted in a frame that moves with the obstacles that press at the start
         or the end of the step. In any other frame these obstacles do work. If no obstacle presses,
-        the frame moves with the body, so that rigid motion has no effect.
+        the frame moves with the body, so that rigid motion has no effect. The frame rests along
+        components that pins or anchors hold, because in a moving frame they do work.
         """
         lattice, owned = self.lattice, slice(self.lattice.owned)
         displacement = result.position[owned] - result.previous[owned]
@@ -171,10 +172,8 @@ class EnergyBalance:
             *(lattice.mass @ displacement / time_step),
         )
         mass, pressing, is_fixed, momentum = sums[0], sums[1], sums[2:5], sums[8:]
-        if pressing > 0:
-            frame = sums[5:8] / (pressing * time_step)
-        else:
-            frame = np.where(is_fixed, 0.0, momentum / mass)
+        moving = sums[5:8] / (pressing * time_step) if pressing > 0 else momentum / mass
+        frame = np.where(is_fixed, 0.0, moving)
         # Impacts follow the solve, so the next step starts with their energy.
         start, _, work, _, _ = self._start(before, result, after, time, time_step, frame)
         ended = self.energies.inner - momentum @ frame + 0.5 * mass * frame @ frame

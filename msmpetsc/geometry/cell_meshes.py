@@ -26,7 +26,7 @@ class Kind(NamedTuple):
 
     faces     : corners of each face, in order around it
     edges     : corners of each edge, in the order of the mid-edge nodes
-    quadratic : node counts of cells whose mid-edge nodes are used; none for pyramids and wedges
+    quadratic : node counts of cells with mid-edge nodes; meshio reads no such pyramids and wedges
     """
 
     dimension: int

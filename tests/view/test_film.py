@@ -160,6 +160,7 @@ def test_the_legend_names_what_is_drawn(falling_ball, tmp_path):
         (["--colour", "part"], "has no part"),
         (["--size", "101x100"], "--size takes two even numbers"),
         (["--speed", "10"], r"--speed is for \*.mp4"),
+        (["--set", "cages.count=3"], "--set is for scenes"),
         (["-o", "x.mp4", "--speed", "0"], "--speed must be above 0"),
         (["-o", "x.mp4", "--speed", "nan"], "--speed must be above 0"),
         (["-o", "x.gif", "--speed", "1e-300"], "--speed 1e-300: the film would last"),

@@ -70,6 +70,8 @@ def style_of(args: argparse.Namespace) -> Style:
 
 def _draw_result(args: argparse.Namespace, path: Path, style: Style) -> None:
     """Draw a result as a picture, a page or a film, by the ending of the path."""
+    if args.set:
+        raise InputError(f"--set is for scenes, and {args.subject} is a result")
     if path.suffix.lower() in PICTURE_NAMES:
         contact_sheet(args.subject, path, args.frames, args.count, style)
         return

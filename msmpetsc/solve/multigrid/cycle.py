@@ -54,7 +54,8 @@ COARSEST_ROOT = 9.0
 # greatest number of surface points that the finest smoother couples; its matrix is
 # dense
 POINTS = 200
-# lower end of a smoother's eigenvalue range [upper end]; coarse grids damp the rest
+# lower end of a smoother's range of eigenvalues, over its upper end [-]; coarse grids
+# damp the rest
 RANGE_START = 0.25
 # factor on an eigenvalue estimated by ten CG iterations [-]; the estimate is too small
 SAFETY = 1.1

@@ -293,19 +293,23 @@ def hierarchy(
     shape: Callable[[np.ndarray], np.ndarray] = at_rest,
     time_step: float = 1 / 60,
     contact: bool = False,
-    coarsest: int = 800,
+    coarsest: int | None = 800,
 ) -> Iterator[Case]:
-    """Yield the cycle of the presets; its coarsest grid has at most ``coarsest`` nodes."""
-    database, before = PETSc.Options(), cycle.COARSEST
+    """Yield the cycle of the presets.
+
+    Its coarsest grid has at most ``coarsest`` nodes, or as many as in a run if that is None.
+    """
+    database, before = PETSc.Options(), (cycle.COARSEST, cycle.COARSEST_ROOT)
     for name, value in LATTICE_MULTIGRID.items():
         database.setValue(name, value)
-    cycle.COARSEST = coarsest
+    if coarsest is not None:
+        cycle.COARSEST, cycle.COARSEST_ROOT = coarsest, coarsest
     case = None
     try:
         case = Case(comm, lattice, shape(lattice.nodes), time_step, contact)
         yield case
     finally:
-        cycle.COARSEST = before
+        cycle.COARSEST, cycle.COARSEST_ROOT = before
         if case:
             case.destroy()
         for name in LATTICE_MULTIGRID:

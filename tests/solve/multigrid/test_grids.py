@@ -85,6 +85,12 @@ def test_no_coarse_node_spans_a_gap(name: str):
             assert connected_components(shares[np.ix_(nodes, nodes)])[0] == 1
 
 
+@pytest.mark.parametrize(("side", "sizes"), [(10, [216]), (16, [729, 125])])
+def test_the_coarsest_grid_grows_with_the_root_of_the_lattice(side: int, sizes: list[int]):
+    with hierarchy(COMM, build(COMM, block(side, side, side)), coarsest=None) as case:
+        assert [level.grid.table.total for level in case.multigrid.levels] == sizes
+
+
 @pytest.mark.parametrize("gap", [1, 2, 3, 4, 6])
 def test_gaps_cost_no_iterations(gap: int):
     """If coarse grids join two prongs clamped at their root, iterations quadruple."""

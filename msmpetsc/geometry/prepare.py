@@ -267,12 +267,11 @@ def _depths(surface: Surface, patch: Indices) -> Indices:
 
 
 def rotate(surface: Surface, turn: dict[str, Any]) -> Surface:
-    """Turn the surface about an axis through the origin: {"axis": [x, y, z], "degrees": d}."""
+    """Turn the surface about a unit axis through the origin: {"axis": [x, y, z], "degrees": d}."""
     # imported here because it is slow and few scenes need it
     from scipy.spatial.transform import Rotation
 
-    axis = np.asarray(turn["axis"], float)
-    rotation = Rotation.from_rotvec(np.deg2rad(turn["degrees"]) * axis / np.linalg.norm(axis))
+    rotation = Rotation.from_rotvec(np.deg2rad(turn["degrees"]) * np.array(turn["axis"]))
     return surface.moved(rotation.apply)
 
 

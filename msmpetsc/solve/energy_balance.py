@@ -306,7 +306,7 @@ class EnergyBalance:
         return sums[[0, 2, 3, 4, 5]]
 
     def _sums(self, *values: SupportsFloat) -> Floats:
-        sums: Floats = reduced(self.comm, np.array([float(value) for value in values]))
+        sums: Floats = reduced(self.comm, [float(value) for value in values])
         return sums
 
     def _worst(self, vectors: Rows) -> str:

@@ -12,7 +12,7 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Floats, Positions
 from msmpetsc.checkpoint import ANY, COUNT, Range
-from msmpetsc.comm import log
+from msmpetsc.comm import log, reduced
 from msmpetsc.contact.obstacles.moving_solid import describe_overlap
 from msmpetsc.elasticity.locate import worst_inverted
 from msmpetsc.environment import Environment
@@ -125,9 +125,7 @@ def times(comm: MPI.Comm, before: dict[str, float]) -> dict[str, float]:
 
     before : seconds of this rank, as ``event_times`` returned them
     """
-    return {
-        name: comm.allreduce(now - before[name], MPI.MAX) for name, now in event_times().items()
-    }
+    return {name: reduced(comm, now - before[name], MPI.MAX) for name, now in event_times().items()}
 
 
 class Monitors:

@@ -12,6 +12,7 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Floats, Positions, Rows
 from msmpetsc.build import Model
+from msmpetsc.comm import reduced
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.lattice.lattice import Lattice
@@ -144,7 +145,7 @@ def _turned(search: Lobpcg, squares: Floats, modes: Rows) -> Rows:
     0. Its product with noise vector i is positive.
     """
     noise = search.functional.noise(len(modes))
-    parts = search.comm.allreduce((modes * search.functional.mass) @ noise.T)
+    parts = reduced(search.comm, (modes * search.functional.mass) @ noise.T)
     differ = np.diff(squares) > ALIKE * np.abs(squares[1:])
     for alike in np.split(np.arange(len(modes)), np.flatnonzero(differ) + 1):
         turn, upper = np.linalg.qr(parts[alike, : len(alike)])
@@ -155,6 +156,6 @@ def _turned(search: Lobpcg, squares: Floats, modes: Rows) -> Rows:
 def time_of_sound(lattice: Lattice) -> float:
     """Return the travel time [s] of sound, of speed sqrt(E / density), along the longest side."""
     stiffness = float(lattice.cell_stiffness[: lattice.cells_owned].sum())
-    mass, edges = lattice.table.comm.allreduce(np.array([float(lattice.mass.sum()), stiffness]))
+    mass, edges = reduced(lattice.table.comm, [float(lattice.mass.sum()), stiffness])
     # An edge has the stiffness 4/7 E h (lattice.material)
     return lattice.longest_side() / lattice.cell_size * float(np.sqrt(4 / 7 * mass / edges))

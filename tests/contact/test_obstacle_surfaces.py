@@ -278,19 +278,24 @@ def test_explicit_steps_refuse_it(tmp_path: Path):
     assert 'obstacle: response = "barrier" is for' in input_error(lambda: load_scene(scene))
 
 
-def test_a_ball_whose_nodes_have_no_triangle_around_is_built(tmp_path: Path):
-    """Some nodes of the ball are corners of cells that contain no triangle of the surface."""
-    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.15)
-    ball.apply_translation([0, 0, 0.152])
-    ball.export(tmp_path / "scene.ply")
-    scene = write_scene(
-        tmp_path,
+def ball_above(folder: Path, obstacle: dict, height: float = 0.0, scale: float = 1.0) -> Path:
+    """Return a scene of a ball of 15 cm, its middle at a height [m], times a scale."""
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.15 * scale)
+    ball.apply_translation([0, 0, height * scale])
+    ball.export(folder / "scene.ply")
+    return write_scene(
+        folder,
         mesh={"source": "scene.ply"},
         cages={"count": 71},
         material=SOLID,
         time={"step": 0.01, "duration": 0.01},
-        obstacle=[FLOOR],
+        obstacle=[obstacle],
     )
+
+
+def test_a_ball_whose_nodes_have_no_triangle_around_is_built(tmp_path: Path):
+    """Some nodes of the ball are corners of cells that contain no triangle of the surface."""
+    scene = ball_above(tmp_path, FLOOR, height=0.152)
     assert len(model_of(scene).lattice.cells) == 72
 
 
@@ -298,17 +303,8 @@ def test_balls_of_a_micrometre_have_the_triangles_of_balls_of_a_metre(tmp_path: 
     """No absolute length merges points of an obstacle."""
     counts = []
     for scale in (1.0, 1e-6):
-        ball = trimesh.creation.icosphere(subdivisions=2, radius=0.15 * scale)
-        ball.export(tmp_path / "scene.ply")
         below = {"shape": "sphere", "center": [0, 0, -0.31 * scale], "radius": 0.15 * scale}
-        scene = write_scene(
-            tmp_path,
-            mesh={"source": "scene.ply"},
-            cages={"count": 71},
-            material=SOLID,
-            time={"step": 0.01, "duration": 0.01},
-            obstacle=[below | {"response": "barrier"}],
-        )
+        scene = ball_above(tmp_path, below | {"response": "barrier"}, scale=scale)
         (obstacle,) = surfaces(model_of(scene)).solids
         counts.append((len(obstacle.points), len(obstacle.triangles)))
     assert counts[0] == counts[1]

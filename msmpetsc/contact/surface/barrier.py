@@ -22,6 +22,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows
+from msmpetsc.comm import reduced
 from msmpetsc.contact.friction import STICK
 from msmpetsc.contact.surface.continuous_collision import candidates_on_paths
 from msmpetsc.contact.surface.creases import creases, neighbours
@@ -78,7 +79,7 @@ class BarrierLaw:
         side     : longest side of the smallest body [m]
         """
         comm, h = lattice.table.comm, lattice.cell_size
-        mass = comm.allreduce(float(lattice.mass.max(initial=0)), MPI.MAX)
+        mass = reduced(comm, float(lattice.mass.max(initial=0)), MPI.MAX)
         layer = (PER_EDGE * lattice.stiffest(comm) + mass / time_step**2) / h**2
         stick = table.friction_speed or STICK * side
         return cls(distance, float(distance**2 * layer), table.friction, stick)

@@ -9,7 +9,7 @@ from mpi4py import MPI
 from scipy.sparse import coo_array, csr_array
 
 from msmpetsc.backend.arrays import Indices, Positions, Rows
-from msmpetsc.comm import Route
+from msmpetsc.comm import Route, reduced
 from msmpetsc.contact.surface.obstacle_surfaces import ObstacleSurfaces
 from msmpetsc.lattice.lattice import Lattice
 
@@ -33,7 +33,7 @@ class SurfacePoints:
         self.comm, self.obstacles, self.bodies = comm, obstacles, sum(counts)
         self.total = self.bodies + obstacles.total
         sizes = abs(embedding).sum(axis=1)
-        self.spread = comm.allreduce(float(sizes.max(initial=0)), MPI.MAX)
+        self.spread = reduced(comm, float(sizes.max(initial=0)), MPI.MAX)
         to_owner = Route(comm, lattice.table.owner_of_index(embedding.indices))
         numbers = sum(counts[: comm.rank]) + np.arange(embedding.shape[0])
         points = to_owner.send(np.repeat(numbers, np.diff(embedding.indptr)))

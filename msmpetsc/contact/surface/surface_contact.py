@@ -13,6 +13,7 @@ from mpi4py import MPI
 from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
+from msmpetsc.comm import reduced
 from msmpetsc.contact.surface.pairs import ContactSearch, SurfaceContactsAt
 from msmpetsc.contact.surface.surface_friction import SurfaceFriction
 
@@ -59,7 +60,7 @@ class SurfaceHessian:
         most       : greatest number of stiff points; the stiffest points come first
         """
         # ``power`` sorts its matrix in place
-        given = self.comm.allreduce(self.weights.copy().power(2) @ compliance)
+        given = reduced(self.comm, self.weights.copy().power(2) @ compliance)
         stiffness = self.points.diagonal().reshape(-1, 3).sum(axis=1) * given
         order = np.argsort(-stiffness, kind="stable")
         stiff = min(most, int((stiffness > 1).sum()))

@@ -22,7 +22,7 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Mask, Positions, Rows, to_host
 from msmpetsc.checkpoint import ANY, Range
-from msmpetsc.comm import log
+from msmpetsc.comm import log, reduced
 from msmpetsc.elasticity.locate import of_body, worst_inverted
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
@@ -74,7 +74,7 @@ class LoadPath:
         self.known = [(0.0, self.base)]
         self.sides = self.state.sides
         first, lattice = self.time < 1.5 * self.time_step, self.stepper.lattice
-        at_rest = self.stepper.comm.allreduce(bool((self.base == lattice.nodes).all()), MPI.LAND)
+        at_rest = reduced(self.stepper.comm, bool((self.base == lattice.nodes).all()), MPI.LAND)
         self.displaced = first and not at_rest
         self.inverted = 0 if first else worst_inverted(self.stepper.comm, lattice, self.base)[0]
         self.holding: Rows | None = None
@@ -163,7 +163,7 @@ class Static(ImplicitEuler):
         lattice = self.environment.lattice
         cells = lattice.longest_side() / lattice.cell_size
         sums = np.array([float(lattice.mass.sum()), _stiffness(lattice)])
-        mass, stiffness = self.comm.allreduce(sums)
+        mass, stiffness = reduced(self.comm, sums)
         return SLENDER * float(cells * np.sqrt(mass / max(stiffness, np.finfo(float).tiny)))
 
     def set_up(self) -> None:
@@ -253,7 +253,7 @@ def refuse_free_bodies(unknowns: Unknowns) -> None:
     support = "held at a point or two, about which it turns"
     free = bodies.free.any(axis=1)
     fixed = to_host(lattice.fixed[: lattice.owned])
-    count = unknowns.comm.allreduce(int(fixed.sum()))
+    count = reduced(unknowns.comm, int(fixed.sum()))
     if free.any():
         along = [axis for axis, moves in zip("xyz", bodies.free[free][0], strict=True) if moves]
         support = f"held by nothing along {', '.join(along)}"
@@ -264,9 +264,9 @@ def refuse_free_bodies(unknowns: Unknowns) -> None:
         number = int(np.argmax(free))
         rows = np.flatnonzero(bodies.number[: lattice.owned] == number)
         own = to_host(lattice.nodes[: lattice.owned])[rows]
-        sums = unknowns.comm.allreduce(np.append(own.sum(axis=0), len(own)))
-        first = unknowns.comm.allreduce(
-            int(rows.min(initial=lattice.owned)) + lattice.table.first, MPI.MIN
+        sums = reduced(unknowns.comm, np.append(own.sum(axis=0), len(own)))
+        first = reduced(
+            unknowns.comm, int(rows.min(initial=lattice.owned)) + lattice.table.first, MPI.MIN
         )
         place = ", ".join(f"{x:.4g}" for x in sums[:3] / sums[3])
         nodes = f"{int(sums[3])} nodes about ({place}) m at rest"

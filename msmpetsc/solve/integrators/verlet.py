@@ -225,9 +225,7 @@ class Verlet(Integrator):
         """
         own = self.elasticity.change(self.position.values, start) - float(self.springs_work)
         mass = self.lattice.mass[: self.lattice.owned, None]
-        gain, kinetic = reduced(
-            self.comm, np.array([own, 0.5 * float(np.vdot(mass * self.v, self.v))])
-        )
+        gain, kinetic = reduced(self.comm, [own, 0.5 * float(np.vdot(mass * self.v, self.v))])
         total = energy + kinetic
         limit = GAIN * total + ROUNDING * self.unstable_energy
         gained = max(self.gained + gain, -OSCILLATION_CREDIT * total)

@@ -15,6 +15,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, like, to_host
 from msmpetsc.backend.kernel import kernel
+from msmpetsc.comm import reduced
 from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.solve.petsc.device import memory_of
@@ -52,12 +53,10 @@ class Unknowns:
         self.rows = self.free.astype(np.uint32)
         self.size = len(self.free)
         first: int = comm.exscan(self.size) or 0  # type: ignore[attr-defined]
-        self.total = comm.allreduce(self.size)
+        self.total = reduced(comm, self.size)
         refuse_unknowns(self.total)
         self.rollers = lattice.rollers
-        self.has_fixed = (
-            self.total < lattice.table.total or comm.allreduce(len(self.rollers[0])) > 0
-        )
+        self.has_fixed = self.total < lattice.table.total or reduced(comm, len(self.rollers[0])) > 0
         own = np.full(lattice.owned, -1, np.int64)
         own[to_host(self.free)] = first + np.arange(self.size)
         node, component = (to_host(rows[self.rollers[0] < lattice.owned]) for rows in self.rollers)
@@ -67,7 +66,7 @@ class Unknowns:
         free_ghosts = lattice.owned + np.flatnonzero(self.numbers[lattice.owned :] >= 0)
         self.free_ghosts = like(self.free, free_ghosts)
         # whether any rank has ghosts
-        self.has_ghosts = comm.allreduce(len(free_ghosts)) > 0
+        self.has_ghosts = reduced(comm, len(free_ghosts)) > 0
         sources = lattice.table.with_ghosts(lattice.ghosts, index)[free_ghosts].ravel()
         self.ghost_values = self._vector(PETSc.COMM_SELF, len(sources))
         vector = self.create_vector()
@@ -187,7 +186,7 @@ def refuse_nonzeros(comm: MPI.Comm, own: int) -> None:
 
     own : number of nonzeros of this rank
     """
-    most = comm.allreduce(own, MPI.MAX)
+    most = reduced(comm, own, MPI.MAX)
     if most > LARGEST:
         raise InputError(
             f"cages: {most} nonzeros of the system matrix on one rank are more than the {LARGEST} "

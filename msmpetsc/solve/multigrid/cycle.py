@@ -22,6 +22,7 @@ from petsc4py import PETSc
 from scipy.sparse import bsr_array
 
 from msmpetsc.backend.arrays import Indices, Positions, Rows, to_host
+from msmpetsc.comm import reduced
 from msmpetsc.contact.surface.surface_contact import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.errors import InputError
@@ -226,7 +227,7 @@ class Multigrid:
         """
         unknowns, lattice = self.unknowns, self.unknowns.lattice.with_springs()
         is_free = unknowns.numbers[to_host(lattice.springs)[: lattice.springs_owned]] >= 0
-        pairs = unknowns.comm.allreduce(int(is_free.all(axis=1).sum()))
+        pairs = reduced(unknowns.comm, int(is_free.all(axis=1).sum()))
         total = PETSc.Mat.InfoType.GLOBAL_SUM
         coarse = [
             (level.grid.table.total, 9 * int(level.pattern.getInfo(total)["nz_used"]))

@@ -9,6 +9,7 @@ from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Rows, like, to_host
 from msmpetsc.backend.kernel import kernel
+from msmpetsc.comm import reduced
 from msmpetsc.solve.linear.ghosts import Ghosted, local_numbers
 from msmpetsc.solve.multigrid.grids import CoarseGrid
 from msmpetsc.solve.petsc.device import memory_of
@@ -54,9 +55,9 @@ class Interpolation:
             Lists(*(like(device, part.astype(np.uint32)) for part in (p.indptr, p.indices)))
             for p in (here, csr_array(here.T))
         )
-        self.memory, any_ghosts = memory_of(device), comm.allreduce(len(self.ghosts)) > 0
+        self.memory, any_ghosts = memory_of(device), reduced(comm, len(self.ghosts)) > 0
         self.coarse = Ghosted(comm, self.own, self.ghosts, device) if any_ghosts else None
-        shape = tuple((3 * size, 3 * comm.allreduce(size)) for size in (rows.shape[0], self.own))
+        shape = tuple((3 * size, 3 * reduced(comm, size)) for size in (rows.shape[0], self.own))
         self.operator = PETSc.Mat().createPython(shape, self, comm=comm)
         self.operator.setVecType(self.memory.vec_type)
         self.operator.setUp()

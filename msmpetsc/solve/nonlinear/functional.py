@@ -190,7 +190,7 @@ class StepFunctional:
                 with CONTACT:
                     elastic += problem.contact.change(q, base)
             change, squared = reduced(
-                self.comm, np.array([inertia + self.t2 * elastic, float(np.vdot(moved, moved))])
+                self.comm, [inertia + self.t2 * elastic, float(np.vdot(moved, moved))]
             )
         return change, squared
 
@@ -277,7 +277,7 @@ class Rounding:
         # Rounding of the rows of F [kg m] per metre of a coordinate
         self.rows = np.tile(ROUNDINGS * diagonal, 3)
         stiffness, mass = reduced(
-            self.comm, np.array([3 * float(diagonal.sum()), float(functional.mass.sum())])
+            self.comm, [3 * float(diagonal.sum()), float(functional.mass.sum())]
         )
         # An error of eps k in the forces moves nodes by at most eps sqrt(sum of t^2 k).
         # This holds in the norm of a positive definite H, and so in the norm of M. The
@@ -311,7 +311,7 @@ class Rounding:
         rows = np.abs(functional.memory.read(iterate.f)) / (
             known * max(functional.extent, np.finfo(float).tiny)
         )
-        squares, count = reduced(self.comm, np.array([float(rows @ rows), rows.size]))
+        squares, count = reduced(self.comm, [float(rows @ rows), rows.size])
         return bool(squares <= count and reduced(self.comm, greatest(rows), MPI.MAX) <= SINGLE_ROW)
 
     @property

@@ -9,6 +9,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Floats, Positions, greatest
+from msmpetsc.comm import reduced
 from msmpetsc.contact.step_contact import Duals, StepContact, StepContactAt
 from msmpetsc.errors import InputError
 from msmpetsc.solve.linear.operators import (
@@ -85,7 +86,7 @@ class Jacobian:
         """Return whether multigrid is faster than Jacobi's preconditioner and rounding keeps M."""
         unknowns, mass = self.unknowns, self.unknowns.lattice.mass[self.unknowns.free]
         inertia = unknowns.inertia[unknowns.free]
-        ratio = self.comm.allreduce(greatest((self.diagonal - inertia) / mass), MPI.MAX)
+        ratio = reduced(self.comm, greatest((self.diagonal - inertia) / mass), MPI.MAX)
         return bool(ratio > STIFF and (unknowns.has_fixed or ratio < MASSLESS))
 
     def multigrid(self) -> LatticePreconditioner:

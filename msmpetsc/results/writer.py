@@ -42,6 +42,7 @@ from msmpetsc.results.layout import (
     chunk_offsets,
     gather_rows,
     is_distributed,
+    number_places,
     open_on_all_ranks,
     open_to_write,
     write_bytes,
@@ -103,8 +104,9 @@ class ResultFile:
         # the file and its storage, on rank 0 only
         self._file: h5py.File | None = None
         self._storage: Storage | None = None
-        # datasets of frames that are not distributed, except time; set by start_frames
-        self._numbers: dict[str, h5py.Dataset] = {}
+        # type and first byte of each field of frames that is not distributed, on rank 0; time
+        # is the last; set by start_frames
+        self._numbers: dict[str, tuple[np.dtype[Any], int]] = {}
         # descriptor of the file on each rank, set by start_frames if all ranks reach it
         self._descriptor: int | None = None
         # lock, temporary name and storage on rank 0, to be released
@@ -202,13 +204,8 @@ class ResultFile:
                     self._flush(self._file)
                     self._refuse_to_replace()
                     os.replace(self._part, self.path)
-                self._numbers = {
-                    name: dataset
-                    for name, dataset in self._file["frames"].items()
-                    if name in FRAME_FIELDS and name != "time" and not is_distributed(name)
-                }
-        if self._comm.size > 1:
-            self._descriptor = open_on_all_ranks(self._comm, self.path)
+                self._numbers = number_places(self._file["frames"])
+        self._descriptor = open_on_all_ranks(self._comm, self.path)
 
     def append(self, frame: Frame) -> None:
         """Store the next frame (collective). After the return a kill cannot lose it."""
@@ -222,13 +219,12 @@ class ResultFile:
                 index,
             )
         with self._together():
-            if self._file is not None:
-                for name, numbers in self._numbers.items():
-                    numbers[index] = getattr(frame, name)
+            if self._file is not None and self._storage is not None:
                 self._flush(self._file)
-                # the frame is finished from here on
-                self._file["frames/time"][index] = frame.time
-                self._flush(self._file)
+                for name, (dtype, start) in self._numbers.items():
+                    numbers = np.ascontiguousarray(getattr(frame, name), dtype)
+                    offset = start + index * numbers.nbytes
+                    write_bytes(self._storage.fileno(), numbers[None], 0, 1, [offset])
         self.finished += 1
 
     def write_checkpoint(self, saved: Checkpoint) -> None:

@@ -116,11 +116,9 @@ def test_who_writes_does_not_show_in_the_file(tmp_path):
 
 
 def test_no_write_leaves_a_broken_file(tmp_path, monkeypatch):
-    """After each replayed write of HDF5 the file opens and holds all finished frames."""
-    disk = Disk()
-    path = tmp_path / "x.h5"
-
-    monkeypatch.setattr(writer, "open_to_write", disk.opened)
+    """After each replayed write the file opens and holds all finished frames."""
+    disk, path = Disk(), tmp_path / "x.h5"
+    disk.replace_file(monkeypatch)
     # number of writes -> (frames, newest checkpoint) that were complete by then
     marks = {}
     file = ResultFile(path, MPI.COMM_SELF, {})
@@ -155,7 +153,7 @@ def test_going_on_writes_nothing_but_numbers_in_their_places(tmp_path, monkeypat
             file.write_checkpoint(saved(index))
     before = path.read_bytes()
     io.BytesIO.write(disk, before)
-    monkeypatch.setattr(writer, "open_to_write", disk.opened)
+    disk.replace_file(monkeypatch)
     file = ResultFile(path, MPI.COMM_SELF, {}, Begin.IN_PLACE)
     file.start_frames(9, NODES, {"surface": POINTS})
     assert file.finished == 3
@@ -203,12 +201,23 @@ class Disk(io.BytesIO):
         # (offset, bytes), or the length to which the file was cut or extended
         self.log = []
 
+    def replace_file(self, monkeypatch):
+        monkeypatch.setattr(writer, "open_to_write", self.opened)
+        monkeypatch.setattr(os, "pwrite", self.place)
+
     def opened(self, _, mode):
         return h5py.File(self, mode, libver="earliest", rdcc_nbytes=0)
 
     def write(self, data):
         self.log.append((self.tell(), bytes(data)))
         return super().write(data)
+
+    def place(self, _, data, offset):
+        here = self.tell()
+        self.seek(offset)
+        self.write(data)
+        self.seek(here)
+        return len(data)
 
     def truncate(self, size=None):
         self.log.append(size)

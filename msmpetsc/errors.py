@@ -106,15 +106,10 @@ def extra_of(module: str, first: str = "run") -> str | None:
     return next((extra for extra in (first, *EXTRAS) if package in EXTRAS[extra]), None)
 
 
-def nearest(name: str, valid: Iterable[str]) -> str | None:
-    """Return the valid name most similar to a misspelt name; None if no name is similar."""
-    return next(iter(difflib.get_close_matches(name, list(valid), n=1)), None)
-
-
 def did_you_mean(name: str, valid: Iterable[str]) -> str:
     """Return ", did you mean 'x'?" with the most similar valid name, or an empty string."""
-    near = nearest(name, valid)
-    return f", did you mean {near!r}?" if near else ""
+    near = difflib.get_close_matches(name, list(valid), n=1)
+    return f", did you mean {near[0]!r}?" if near else ""
 
 
 def body_names(count: int) -> list[str]:

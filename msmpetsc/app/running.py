@@ -64,13 +64,8 @@ class RunPlan:
     logged: dict[str, float]
 
 
-def run_steps(
-    comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None, started: float
-) -> int:
-    """Run from the start or continue an earlier run; return the exit status (collective).
-
-    started : perf_counter at the start of the command [s]
-    """
+def run_steps(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -> int:
+    """Run from the start or continue an earlier run; return the exit status (collective)."""
     plan = prepare(comm, request, earlier)
     if (resumed := plan.resumed) and resumed.is_done:
         write_companions(comm, request, whole=True)
@@ -78,7 +73,7 @@ def run_steps(
             "%s has all its %d frames: nothing left to do", request.path, resumed.earlier.finished
         )
         return 0
-    return finish(comm, plan, *take_steps(comm, plan), started)
+    return finish(comm, plan, *take_steps(comm, plan))
 
 
 def prepare(comm: MPI.Intracomm, request: RunRequest, earlier: Earlier | None) -> RunPlan:
@@ -159,7 +154,6 @@ def finish(
     ended: Checkpoints,
     cost: Cost,
     failure: StepFailed | None,
-    started: float,
 ) -> int:
     """Write the files beside the result, log the end, and return the exit status (collective).
 
@@ -169,7 +163,8 @@ def finish(
     if request.measured:
         cost.write(request.measured, request.command, plan.logged, failure)
     left = write_companions(comm, request, whole=not ended.signal and failure is None)
-    on_root(comm, lambda: log_end(ended.file.finished, perf_counter() - started, cost.setup, left))
+    seconds = perf_counter() - plan.began
+    on_root(comm, lambda: log_end(ended.file.finished, seconds, cost.setup, left))
     if failure:
         raise failure
     if ended.signal:

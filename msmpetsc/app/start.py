@@ -11,7 +11,6 @@ from functools import partial
 from numbers import Integral
 from os import PathLike
 from pathlib import Path
-from time import perf_counter
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
@@ -88,11 +87,10 @@ def run(*values: Any, **keywords: Any) -> Path:
 
 def carry_out(comm: MPI.Intracomm, request: RunRequest) -> int:
     """Run a request; return the exit status (collective)."""
-    started = perf_counter()
     with options_given(comm, request) as (request, earlier):
         from msmpetsc.app.running import run_steps
 
-        return run_steps(comm, request, earlier, started)
+        return run_steps(comm, request, earlier)
 
 
 def options_shown(comm: MPI.Intracomm, request: RunRequest) -> list[str]:

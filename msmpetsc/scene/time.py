@@ -12,7 +12,8 @@ from msmpetsc.scene.values import IntegratorName, Positive, Table, only_for
 MAX_STEPS = 10**9
 STATIC: Final = "static"
 IMPLICIT = ("implicit-euler", "bdf2")
-# keys of loads, anchors and obstacles that vary over time
+# tables whose keys TIME_KEYS say that they vary over time
+LOADS = ("anchor", "force", "traction", "pressure", "obstacle", "body")
 TIME_KEYS = ("path", "times", "start", "stop")
 
 
@@ -78,24 +79,21 @@ def one_state(data: Any) -> Any:
     time = data.get("time") if isinstance(data, dict) else None
     if not isinstance(time, dict) or time.get("integrator") != STATIC:
         return data
-    for load in _loads(data):
-        if (
-            isinstance(load.get("total", load.get("value")), dict)
-            or "function" in load
-            or any(name in load for name in TIME_KEYS)
-        ):
-            return data
+    if any(_varies(data.get(name)) for name in LOADS):
+        return data
     single = time.get("step", time.get("duration", 1.0))
     return {**data, "time": {"step": single, "duration": single, **time}}
 
 
-def _loads(tables: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """Yield the unchecked tables of anchors, loads and obstacles, also from the bodies' tables."""
-    for name in ("anchor", "force", "traction", "pressure", "obstacle", "body"):
-        given = tables.get(name)
-        for table in given if isinstance(given, list | tuple) else ():
-            if isinstance(table, dict):
-                yield from _loads(table) if name == "body" else [table]
+def _varies(value: Any) -> bool:
+    """Return whether unchecked tables have a key of a load that varies over time."""
+    if isinstance(value, list | tuple):
+        return any(map(_varies, value))
+    # the start of a load is a number, the start of a body is a table
+    return isinstance(value, dict) and any(
+        (name in TIME_KEYS and not isinstance(inner, dict)) or _varies(inner)
+        for name, inner in value.items()
+    )
 
 
 def unlike_the_integrator(scene: Any) -> Iterator[Broken]:

@@ -67,7 +67,7 @@ def as_given(value: Any) -> str:
     else:
         try:
             shown = json.dumps(value, ensure_ascii=False, default=str)
-        # Python converts no integer of over 4,300 digits
-        except ValueError:
-            return "a number too long to show"
+        # Python converts no integer of over 4,300 digits and no table of many levels
+        except (ValueError, RecursionError):
+            return "a value too long to show"
     return printable(shown, 60) if len(shown) <= 60 else printable(shown, 57) + "..."

@@ -143,12 +143,7 @@ def scene_of(
 def _checked(
     path: Path, data: dict[str, Any], text: str, changes: Changes
 ) -> tuple[Scene, Collection[KeyPath]]:
-    """Return the checked scene, and the key paths that the changes set.
-
-    text : TOML text of ``data``; "" for tables
-
-    Raises InputError with a line for each problem.
-    """
+    """Return the checked scene, and the key paths that the changes set. Raises InputError."""
     keys = {_override(data, override): override for override in overrides_of(changes)}
     try:
         checked = SceneFile.model_validate(data)
@@ -158,6 +153,8 @@ def _checked(
         return Scene(**given, text=text, folder=path.parent), keys
     except ValidationError as error:
         raise InputError("\n".join(problem_lines(path, error))) from None
+    except RecursionError:
+        raise InputError(f"{path}: its tables have too many levels") from None
     except TypeError as error:
         raise InputError(f"{path}: cannot be written as TOML: {error}") from None
 
@@ -245,10 +242,7 @@ def _override_value(raw: str) -> Any:
 
 
 def _put(container: Any, key: str | int, value: Any, replace: bool) -> Any:
-    """Set ``key`` of a table or list to ``value`` and return the value at ``key``.
-
-    An existing value is kept unless ``replace``. Raises InputError for a key that cannot be set.
-    """
+    """Return the value at ``key``, set if it is absent or ``replace``. Raises InputError."""
     if isinstance(container, dict):
         key = str(key)
         if replace or key not in container:

@@ -30,14 +30,12 @@ def test_default_range_and_meaning_are_those_of_the_schema():
         "mass density [kg/m^3]",
     )
     assert key("time.error").bounds == "> 0, < 1"
-    assert (
-        key("cages.boundary").bounds == "fill | whole" and key("cages.boundary").default == '"fill"'
-    )
+    assert key("cages.boundary").bounds == "fill | whole"
+    assert key("cages.boundary").default == '"fill"'
     assert key("output.surface").default == "true"
     assert key("material.young_modulus").default == "one of young_modulus, stiffness"
-    assert key("obstacle.N.stop").default == "none" and key("obstacle.N.stop").about.endswith(
-        "to the end if absent"
-    )
+    assert key("obstacle.N.stop").default == "none"
+    assert key("obstacle.N.stop").about.endswith("to the end if absent")
 
 
 def test_a_table_or_a_key_is_chosen_by_its_name_and_a_number_does_not_matter():

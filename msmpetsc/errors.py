@@ -50,17 +50,8 @@ NO_ROOM = ENOSPC, EDQUOT, EFBIG
 # import names of the packages in each extra of pyproject.toml
 EXTRAS = {
     "run": (
-        "petsc4py",
-        "mpi4py",
-        "scipy",
-        "numba",
-        "pydantic",
-        "tomli_w",
-        "trimesh",
-        "igl",
-        "pooch",
-        "psutil",
-        "tqdm",
+        "petsc4py", "mpi4py", "scipy", "numba", "pydantic", "tomli_w", "trimesh", "igl", "pooch",
+        "psutil", "tqdm",
     ),
     "mesh": ("meshio", "manifold3d", "fast_simplification"),
     "render": ("pyvista", "scipy", "pydantic", "tomli_w", "trimesh", "igl", "tqdm"),
@@ -70,7 +61,7 @@ EXTRAS = {
     "usd": ("pxr",),
     "repair": ("pymeshfix",),
     "cuda": ("cupy",),
-}
+}  # fmt: skip
 
 
 def as_expected(error: Exception, extra: str = "run") -> MsmpetscError | None:
@@ -83,11 +74,9 @@ def as_expected(error: Exception, extra: str = "run") -> MsmpetscError | None:
         return InputError(
             f"there is not enough memory ({reason}): use fewer cells, or ranks on more machines"
         )
-    if isinstance(error, OSError) and error.errno in NO_ROOM:
-        return InputError(f"{error.filename or 'the output'} cannot be written: {error.strerror}")
-    # for example a missing mpiexec, or a folder that cannot be created
-    if isinstance(error, OSError) and error.filename:
-        return InputError(f"{error.filename}: {error.strerror}")
+    # for example a missing mpiexec, a folder that cannot be created, or a full disk
+    if isinstance(error, OSError) and (error.filename or error.errno in NO_ROOM):
+        return InputError(f"{error.filename or 'the output'}: {error.strerror}")
     if isinstance(error, ModuleNotFoundError) and extra_of(error.name or ""):
         return missing_package(error.name or "", extra)
     return error if isinstance(error, MsmpetscError) else None

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from signal import Signals
+from tempfile import TemporaryFile
 from time import perf_counter
 
 import numpy as np
@@ -24,7 +25,7 @@ from msmpetsc.errors import StepFailed
 from msmpetsc.fields import Frame
 from msmpetsc.geometry.thickness import thickness_words
 from msmpetsc.lattice.material import STEPS_A_PERIOD, bending_period
-from msmpetsc.results.disk import plain_errors, refuse_no_file, write_whole
+from msmpetsc.results.disk import plain_errors, write_whole
 from msmpetsc.results.progress_bar import duration
 from msmpetsc.scene.reading import Scene
 from msmpetsc.solve.instrumentation import times
@@ -172,13 +173,9 @@ class Cost:
 def refuse_unwritable(path: Path | None) -> None:
     """Raise InputError for a file that cannot be written, so that a run fails before its steps."""
     if path:
-        existed = path.exists()
         with plain_errors(path):
-            refuse_no_file(path)
             path.parent.mkdir(parents=True, exist_ok=True)
-            open(path, "a").close()
-            if not existed:
-                path.unlink()
+            TemporaryFile(dir=path.parent).close()
 
 
 def versions() -> dict[str, str]:

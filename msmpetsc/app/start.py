@@ -8,10 +8,9 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
-from numbers import Integral
 from os import PathLike
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, Literal, ParamSpec, TypeVar
 
 import numpy as np
 from mpi4py import MPI
@@ -124,7 +123,7 @@ def frames(
     frames: int | None = None,
     *,
     set: Mapping[str, Any] | None = None,
-    device: str | None = None,
+    device: Literal["cpu", "cuda"] | None = None,
     petsc_options: str | Mapping[str, Any] = "",
 ) -> Iterator[Frame]:
     """Yield the frames of a scene without writing a file (collective).
@@ -180,7 +179,7 @@ class Simulation:
         self,
         scene: Source,
         *,
-        device: str | None = None,
+        device: Literal["cpu", "cuda"] | None = None,
         petsc_options: str | Mapping[str, Any] = "",
     ):
         """Read and check the scene; the first run reads the mesh.
@@ -195,8 +194,8 @@ class Simulation:
         InputError
             The scene or an option cannot be used.
         """
-        if device not in (None, "cpu", "cuda"):
-            raise InputError(f"device must be cpu or cuda, not {device!r}")
+        # raises InputError for an unknown device
+        RunRequest(device=device)
         self.comm, self.device = MPI.COMM_WORLD, device
         if not isinstance(scene, Scene):
             scene = Scene.of(scene) if isinstance(scene, Mapping) else Scene.load(scene)
@@ -237,12 +236,10 @@ class Simulation:
         StepFailed
             A time step failed; raised in the loop, on all ranks.
         """
+        # raises InputError for a wrong number of frames
+        RunRequest(frames=frames)
         scene = self.scene.changed(set or {})
         if frames is not None:
-            if not isinstance(frames, Integral):
-                raise InputError(f"frames must be a whole number, not {frames!r}")
-            if frames < 1:
-                raise InputError(f"frames must be at least 1, not {frames}")
             scene = scene.changed({"time.duration": frames * scene.time.step})
         return self._steps(scene)
 

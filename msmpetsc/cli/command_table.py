@@ -17,7 +17,6 @@ Argument = tuple[tuple[str, ...], dict[str, Any]]
 class Command:
     """A command of the command line.
 
-    exclusive   : arguments that exclude each other
     starts_runs : whether the command starts runs in other processes
     module      : module in ``commands`` with its ``run`` function; the command's name if empty
     """
@@ -25,7 +24,6 @@ class Command:
     help: str
     examples: tuple[str, ...]
     arguments: tuple[Argument, ...] = ()
-    exclusive: tuple[Argument, ...] = ()
     description: str | None = None
     starts_runs: bool = False
     module: str = ""
@@ -226,16 +224,14 @@ COMMANDS = {
             switch("--full", "also run the long cases, marked full = true"),
             whole("--jobs", "N", "number of cases to run at a time (they slow each other)"),
             switch("--restart", "run finished cases again"),
-        ),
-        (
             argument(
                 "--part", metavar="I/N",
                 help="run only the I-th of N parts, for several machines or array tasks",
             ),
             switch("--list", "list the cases and which are done, and run nothing"),
         ),
-        "Run the cases of a study, each in its own process, and write a table and a report. "
-        "After a stop the same command continues.",
+        description="Run the cases of a study, each in its own process, and write a table and a "
+        "report. After a stop the same command continues.",
         starts_runs=True,
     ),
     "plan": Command(

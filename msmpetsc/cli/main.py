@@ -24,13 +24,7 @@ import msmpetsc
 from msmpetsc.app.abort import ending_together, logged_on_root
 from msmpetsc.app.ranks import world
 from msmpetsc.cli.command_table import COMMANDS, VERBOSITY, Shown
-from msmpetsc.errors import (
-    STATUS_BUG,
-    STATUS_INTERRUPTED,
-    InputError,
-    MsmpetscError,
-    did_you_mean,
-)
+from msmpetsc.errors import STATUS_BUG, STATUS_INTERRUPTED, InputError, MsmpetscError, did_you_mean
 
 # commands that need the packages of the extra "render" only
 READING = ("render", "export", "compare", "series")
@@ -154,10 +148,7 @@ def parsed(words: list[str]) -> argparse.Namespace:
 
 
 def split_petsc_options(words: list[str]) -> tuple[list[str], list[str]]:
-    """Return the words of msmpetsc, and the words of PETSc options.
-
-    A PETSc option has a single dash, and may have a value.
-    """
+    """Return the words of msmpetsc, and the words of PETSc options, which may have a value."""
     ours: list[str] = []
     petsc: list[str] = []
     for before, word in pairwise(["", *words]):
@@ -238,17 +229,15 @@ def command_parser() -> Parser:
         )
         for names, keywords in command.arguments:
             add.add_argument(*names, **keywords)
-        for choice in filter(None, (command.exclusive, VERBOSITY)):
-            group = add.add_mutually_exclusive_group()
-            for names, keywords in choice:
-                group.add_argument(*names, **keywords)
+        group = add.add_mutually_exclusive_group()
+        for names, keywords in VERBOSITY:
+            group.add_argument(*names, **keywords)
     return parser
 
 
 def option_names(command: str) -> list[str]:
     """Return the names of a command's options, for example "--preset"."""
-    known = COMMANDS[command]
-    given = (*known.arguments, *known.exclusive, *VERBOSITY)
+    given = (*COMMANDS[command].arguments, *VERBOSITY)
     return ["--help", *(name for names, _ in given for name in names if name.startswith("-"))]
 
 

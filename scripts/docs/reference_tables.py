@@ -108,10 +108,9 @@ def commands() -> str:
     lines = []
     for name, command in COMMANDS.items():
         about = command.description or f"{command.help[:1].upper()}{command.help[1:]}."
-        arguments = [*command.arguments, *command.exclusive]
         lines += [f"## {name}", about, "```text\n" + "\n".join(command.examples) + "\n```"]
-        if arguments:
-            lines.append(table(("argument", "meaning"), map(row_of, arguments)))
+        if command.arguments:
+            lines.append(table(("argument", "meaning"), map(row_of, command.arguments)))
     lines += ["## Every command", table(("argument", "meaning"), map(row_of, VERBOSITY))]
     return "\n\n".join(lines)
 

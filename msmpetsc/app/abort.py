@@ -45,9 +45,7 @@ def logged_on_root(
 
 @contextmanager
 def ending_together(
-    comm: "MPI.Comm",
-    extra: str = "run",
-    abandon: Callable[[], None] = lambda: None,
+    comm: "MPI.Comm", extra: str = "run", abandon: Callable[[], None] = lambda: None
 ) -> Iterator[None]:
     """Raise an error of the block if all ranks fail, and abort all ranks if only some fail.
 

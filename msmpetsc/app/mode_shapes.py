@@ -48,10 +48,7 @@ def refuse_existing(request: RunRequest) -> None:
 
 
 def _write(comm: MPI.Intracomm, plan: "RunPlan", model: "Model", modes: "Modes") -> None:
-    """Write the base state as frame 0, then a frame for each shape (collective).
-
-    Raises InputError if the file cannot be written.
-    """
+    """Write the base state as frame 0, then a frame for each shape (collective)."""
     from msmpetsc.app.running import open_output, write_companions
     from msmpetsc.lattice.embedded_surface import EmbeddedPoints
     from msmpetsc.results.writer import write_model

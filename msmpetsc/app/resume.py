@@ -38,13 +38,9 @@ OF_NO_EFFECT = re.compile(
 )
 # keys of a scene that cannot change within a result file
 FIXED = (
-    "time.step",
-    "time.integrator",
-    "output.every",
-    "output.surface",
-    "output.stress",
-    "output.probe",
-)
+    "time.step", "time.integrator",
+    "output.every", "output.surface", "output.stress", "output.probe",
+)  # fmt: skip
 # fields of a scene that do not affect the run
 IGNORED = {"text", "folder", "title", "picture"}
 

@@ -149,11 +149,7 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> tuple[Checkpoints, Cost, S
 
 
 def finish(
-    comm: MPI.Intracomm,
-    plan: RunPlan,
-    ended: Checkpoints,
-    cost: Cost,
-    failure: StepFailed | None,
+    comm: MPI.Intracomm, plan: RunPlan, ended: Checkpoints, cost: Cost, failure: StepFailed | None
 ) -> int:
     """Write the files beside the result, log the end, and return the exit status (collective).
 

@@ -78,8 +78,7 @@ class MeshTable(Table):
         None, description="longest side of the bounding box [m]; as in the file if absent"
     )
     base: Vector | None = Field(
-        None,
-        description="centre of the bounding box's bottom face [m]; as in the file if absent",
+        None, description="centre of the bounding box's bottom face [m]; as in the file if absent"
     )
 
 
@@ -123,8 +122,7 @@ class Material(Table):
         SOLID, description="neo-hookean: a solid; linear: springs with Poisson's ratio 1/4"
     )
     poisson_ratio: PoissonRatio = Field(
-        0.25,
-        description='Poisson\'s ratio, with law = "neo-hookean"; tissue has 0.45 to 0.49 [-]',
+        0.25, description='Poisson\'s ratio, with law = "neo-hookean"; tissue has 0.45 to 0.49 [-]'
     )
     volume: Literal["quadratic", "log", "simo"] = Field(
         "quadratic",
@@ -132,8 +130,7 @@ class Material(Table):
         "quadratic, lambda/2 (J - 1)^2; log, lambda/2 (ln J)^2; simo, lambda/4 (J^2 - 1 - 2 ln J)",
     )
     damping: NotNegative = Field(
-        0.0,
-        description="mass-proportional damping: free velocities decay as exp(-damping t) [1/s]",
+        0.0, description="mass-proportional damping: free velocities decay as exp(-damping t) [1/s]"
     )
     retardation_time: NotNegative = Field(
         0.0,
@@ -190,8 +187,7 @@ class Region(Table):
 
     one_of = ("box", "sphere", "half_space", "painted", "group")
     box: Box | None = Field(
-        None,
-        description="two corners, the lower coordinates first [m], or [-] if relative",
+        None, description="two corners, the lower coordinates first [m], or [-] if relative"
     )
     sphere: Sphere | None = Field(None, description="a ball [m], or [-] if relative")
     half_space: HalfSpace | None = Field(None, description="a half-space [m], or [-] if relative")
@@ -208,8 +204,7 @@ class Region(Table):
         "these cut, and everything inside a closed group [-]",
     )
     relative: bool = Field(
-        False,
-        description="coordinates run from 0 to 1 along each side of the rest bounding box",
+        False, description="coordinates run from 0 to 1 along each side of the rest bounding box"
     )
 
     @field_validator("relative")

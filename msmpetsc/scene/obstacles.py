@@ -54,16 +54,14 @@ class ObstacleTable(Table):
         None, description="two corners of the box, the lower coordinates first [m]"
     )
     center: Vector | None = Field(
-        None,
-        description="centre of the sphere; of a barrier, the centre of rotation at time 0 [m]",
+        None, description="centre of the sphere; of a barrier, the centre of rotation at time 0 [m]"
     )
     radius: Positive | None = Field(None, description="radius of the sphere [m]")
     mesh: MeshTable | None = Field(
         None, description="a closed surface whose inside is the obstacle"
     )
     function: FunctionName | None = Field(
-        None,
-        description="name of a signed distance function, registered in Python or installed",
+        None, description="name of a signed distance function, registered in Python or installed"
     )
     path: Path = Field((), description=f"motion of the obstacle: {PATH} [s, m, degrees]")
     start: NotNegative = Field(0.0, description="time from which the obstacle exists [s]")
@@ -88,8 +86,7 @@ class ObstacleTable(Table):
         "the stiffest spring if absent",
     )
     friction: NotNegative | None = Field(
-        None,
-        description='Coulomb friction coefficient, with response = "penalty"; 0 if absent [-]',
+        None, description='Coulomb friction coefficient, with response = "penalty"; 0 if absent [-]'
     )
     friction_speed: Positive | None = Field(
         None, description=f'with response = "penalty", {FRICTION_SPEED}'

@@ -26,11 +26,7 @@ HEIGHT = {name: height for height, names in enumerate(LAYERS) for name in names.
 PACKAGE = Path(__file__).parent.parent / "msmpetsc"
 ONLY_IN = {"petsc4py": {"solve", "app", "cli"}, "slepc4py": {"solve"}, "argparse": {"cli"}}
 # results can be read and drawn without PETSc
-NEVER = {
-    ("results", "solve"),
-    ("view", "solve"),
-    ("export", "solve"),
-}
+NEVER = {("results", "solve"), ("view", "solve"), ("export", "solve")}
 
 
 def imported(tree: ast.AST) -> Iterator[str]:

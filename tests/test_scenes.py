@@ -36,11 +36,7 @@ PAPER_CELLS = {
 # neo-Hookean scenes, which are not the paper's either
 TISSUE_CELLS = {"heart_tissue": 1500}
 # scenes that are not the paper's
-TOUCHING_CELLS = {
-    "two_bunnies": 1500,
-    "pile": 1000,
-    "armadillo_fold": 3000,
-}
+TOUCHING_CELLS = {"two_bunnies": 1500, "pile": 1000, "armadillo_fold": 3000}
 ALL = sorted(path.stem for path in SCENES.glob("*.toml"))
 
 

@@ -257,10 +257,3 @@ def test_a_resumed_run_exports_the_steps_that_are_left(tmp_path: Path, caplog):
     msmpetsc.run(resume=first, export=tmp_path / "y", export_steps="1,21", **longer)
     assert [each.name for each in (tmp_path / "y").iterdir()] == ["step_21"]
     assert "no linear system was solved in step 1" in caplog.text
-
-
-def test_a_step_without_a_solve_is_told(tmp_path: Path, caplog):
-    """A static step under the load of the step before has no system to solve."""
-    path = clamped_beam(tmp_path, time={"step": 1.0, "duration": 2.0, "integrator": "static"})
-    msmpetsc.run(path, tmp_path / "x.h5", export=tmp_path / "y", export_steps="1,2")
-    assert "no linear system was solved in step 2" in caplog.text

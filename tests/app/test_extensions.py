@@ -181,8 +181,6 @@ def test_a_scene_file_names_what_is_installed(tmp_path: Path):
     velocity = np.diff((positions - positions[0])[:, 0, 2]) / STEP
     assert np.allclose(velocity, SPEED * (1 - RATE * STEP) ** np.arange(1, 11), rtol=1e-9)
     broken = command("--overwrite", "--set", "force.0.function=broken")
-    assert (
-        broken.returncode == 2
-        and "the force 'broken' that is installed cannot be imported" in broken.stderr
-    )
+    assert broken.returncode == 2
+    assert "the force 'broken' that is installed cannot be imported" in broken.stderr
     assert broken.stderr.count("\n") == 1

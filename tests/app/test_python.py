@@ -12,6 +12,7 @@ import pytest
 from block_scene import GRAVITY, block_scene
 from conftest import WORKERS, run
 from one_process import errors, input_error
+from stopped_runs import signal_after
 
 import msmpetsc
 from msmpetsc.app import abort
@@ -96,12 +97,9 @@ def test_what_cannot_be_meant_raises(scene: Path, tmp_path: Path, words: str):
 
 
 def test_an_interrupt_raises_and_the_run_goes_on(scene: Path, tmp_path: Path, monkeypatch):
-    from stopped_runs import signal_after
-
-    with monkeypatch.context() as patch:
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         signal_after(patch, 2, signal.SIGINT)
-        with pytest.raises(KeyboardInterrupt):
-            msmpetsc.run(scene, tmp_path / "x.h5", quiet=True)
+        msmpetsc.run(scene, tmp_path / "x.h5", quiet=True)
     path = msmpetsc.run(resume=tmp_path / "x.h5", quiet=True)
     assert len(positions(path)) == 6
 
@@ -130,11 +128,7 @@ def test_help_shows_all_keywords_with_their_types():
 
 
 # ranks that fail, place and kind of the failure
-FAILING_RANKS = [
-    ("1", "step", "input"),
-    ("0", "model", "memory"),
-    ("1,2", "model", "input"),
-]
+FAILING_RANKS = [("1", "step", "input"), ("0", "model", "memory"), ("1,2", "model", "input")]
 
 
 @pytest.mark.parametrize(("ranks", "where", "what"), FAILING_RANKS)
@@ -145,11 +139,8 @@ def test_a_failure_of_some_ranks_ends_all_with_its_line_and_status(tmp_path, ran
     done = run(3, worker, ranks, where, what, "run", scene, "-o", tmp_path / "x.h5")
     said = {"input": "it fails", "memory": "there is not enough memory (Unable"}[what]
     (line,) = errors(done.stderr)
-    assert (
-        done.returncode == 2
-        and line.startswith(f"msmpetsc: error: {said}")
-        and "Traceback" not in done.stderr
-    )
+    assert done.returncode == 2 and line.startswith(f"msmpetsc: error: {said}")
+    assert "Traceback" not in done.stderr
     assert not [path.name for path in tmp_path.glob("*x.h5.*")]
 
 

@@ -110,15 +110,12 @@ def test_the_lattice_is_kept_while_mesh_and_cages_are(scene: Path):
         *_, kept = simulation.frames(set={"output.surface": True} | change)
         *_, fresh = msm.frames(scene, set={"output.surface": True} | change)
         assert simulation.model.lattice.table is network and simulation.model.embedding is embedding
-        assert np.array_equal(kept.position, fresh.position) and np.array_equal(
-            kept.surface, fresh.surface
-        )
+        assert np.array_equal(kept.position, fresh.position)
+        assert np.array_equal(kept.surface, fresh.surface)
         assert not np.array_equal(kept.position, first.position)
     list(simulation.frames(1, set={"cages.cell_size": 1 / 4}))
-    assert (
-        simulation.model.lattice.table is not network
-        and simulation.model.lattice.cell_size == 1 / 4
-    )
+    assert simulation.model.lattice.table is not network
+    assert simulation.model.lattice.cell_size == 1 / 4
 
 
 def test_a_loop_may_end_early_and_leaves_nothing_behind(scene: Path):
@@ -168,26 +165,17 @@ def test_a_step_that_fails_raises_after_the_frames_before_it(tmp_path: Path):
         next(frames)
 
 
-def test_a_callback_sees_each_stored_frame(scene: Path, tmp_path: Path):
-    seen = []
-    path = msm.run(
-        scene, tmp_path / "x.h5", set={"output.every": 2}, on_frame=seen.append, quiet=True
-    )
-    with msm.open(path) as result:
-        assert [frame.index for frame in seen] == [0, 2, 3]
-        assert np.array_equal([frame.position for frame in seen], result.frames.position[:])
+def test_a_callback_sees_each_stored_frame_and_may_change_it(scene: Path, tmp_path: Path):
+    def turned(frame: msm.Frame) -> None:
+        seen.append((frame.index, frame.position.copy()))
+        frame.position[:] -= frame.position.mean(axis=0)
 
-
-def test_a_callback_may_change_its_frame(scene: Path, tmp_path: Path):
-    def turn(frame: msm.Frame) -> None:
-        x = frame.position
-        x -= x.mean(axis=0)
-
-    left, changed = (
-        msm.run(scene, tmp_path / name, on_frame=called, quiet=True)
-        for name, called in (("left.h5", None), ("changed.h5", turn))
-    )
+    seen, few = [], {"output.every": 2}
+    left = msm.run(scene, tmp_path / "left.h5", set=few, quiet=True)
+    changed = msm.run(scene, tmp_path / "changed.h5", set=few, on_frame=turned, quiet=True)
+    assert [index for index, _ in seen] == [0, 2, 3]
     with msm.open(left) as expected, msm.open(changed) as found:
+        assert np.array_equal([position for _, position in seen], expected.frames.position[:])
         assert np.array_equal(found.frames.position[:], expected.frames.position[:])
 
 

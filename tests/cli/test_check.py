@@ -42,13 +42,8 @@ def test_the_numbers_say_how_they_were_made(numbers: Path):
     assert read(numbers).run == Recipe(cells=None, steps=STEPS, changes=["material.density=900.0"])
     # springs along edges and face diagonals of 4 x 4 x 2 cells
     springs = (60 + 60 + 50) + 2 * (48 + 40 + 40) + 4 * 32
-    assert stored["counts"] == {
-        "cells": 32,
-        "nodes": 75,
-        "springs": springs,
-        "pinned": 25,
-        "frames": STEPS + 1,
-    }
+    counts = {"cells": 32, "nodes": 75, "springs": springs, "pinned": 25, "frames": STEPS + 1}
+    assert stored["counts"] == counts
     assert judged(read(numbers), read(numbers)) == []
 
 
@@ -81,11 +76,8 @@ def test_a_scene_that_fails_is_named_and_the_others_are_checked(
     alone.with_suffix(".baseline.json").write_text(numbers.read_text())
     assert status_of("check", alone, scene) == 1
     out = capfd.readouterr().out
-    assert (
-        "alone                FAILED\n" in out
-        and " same\n" in out
-        and f"\n{alone}: the run failed: mesh" in out
-    )
+    assert "alone                FAILED\n" in out and " same\n" in out
+    assert f"\n{alone}: the run failed: mesh" in out
 
 
 def test_a_changed_scene_differs_until_its_numbers_are_stored_anew(
@@ -106,19 +98,13 @@ def test_a_changed_scene_differs_until_its_numbers_are_stored_anew(
 def test_what_cannot_be_checked_is_refused_in_one_line(scene: Path, numbers: Path, tmp_path: Path):
     other = block_scene(tmp_path, time={"step": 0.01, "duration": 1.0, "error": 1e-2})
     few = ("--set", "time={step=1e-2, duration=1}")
+    tiny = ("--set", "cages={cell_size=0.125, max_cells=1}")
     refused = {
         "nothing is stored of": ["check", str(other)],
         "are for --update": ["check", str(scene), "--cells", "30"],
         "time.error": ["check", "--update", str(other)],
         "--frames must be at least 1": ["check", "--update", str(other), "--frames", "0"],
-        "the run failed": [
-            "check",
-            "--update",
-            str(other),
-            *few,
-            "--set",
-            "cages={cell_size=0.125, max_cells=1}",
-        ],
+        "the run failed": ["check", "--update", str(other), *few, *tiny],
     }
     for words, command in refused.items():
         assert words in command_error(*command)

@@ -1,5 +1,6 @@
 """The command line: output, refusals, and failures that neither hang nor leave files."""
 
+import re
 import subprocess
 import tomllib
 from pathlib import Path
@@ -37,15 +38,6 @@ COMMAND = ("-m", "msmpetsc.cli.main", "run")
 ball = trimesh.creation.icosphere(subdivisions=2, radius=1)
 
 
-def write_ply(path: Path, points: np.ndarray, triangles: np.ndarray) -> None:
-    """Write a PLY file as text, so that NaN and infinity are kept."""
-    coordinates = "".join(f"property double {axis}\n" for axis in "xyz")
-    head = f"ply\nformat ascii 1.0\nelement vertex {len(points)}\n{coordinates}"
-    head += f"element face {len(triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
-    rows = [*points.tolist(), *([3, *corners] for corners in triangles.tolist())]
-    path.write_text(head + "".join(" ".join(map(str, row)) + "\n" for row in rows))
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
     """Return a folder with scene.toml, its ball, and faulty meshes and scenes."""
@@ -53,10 +45,14 @@ def folder(tmp_path_factory) -> Path:
     (folder / "scene.toml").write_text(SCENE)
     nan = ball.vertices.copy()
     nan[3] = np.nan
-    write_ply(folder / "ball.ply", ball.vertices, ball.faces)
-    write_ply(folder / "nan.ply", nan, ball.faces)
-    write_ply(folder / "foil.ply", ball.vertices * [1, 1, 1e-5], ball.faces)
-    write_ply(folder / "open.ply", ball.vertices, ball.faces[20:])
+    meshes = {
+        "ball": (ball.vertices, ball.faces),
+        "nan": (nan, ball.faces),
+        "foil": (ball.vertices * [1, 1, 1e-5], ball.faces),
+        "open": (ball.vertices, ball.faces[20:]),
+    }
+    for name, (points, triangles) in meshes.items():
+        trimesh.Trimesh(points, triangles, process=False).export(folder / f"{name}.ply")
     return folder
 
 
@@ -89,17 +85,8 @@ def test_the_default_output_is_in_out_and_is_not_replaced_unasked(
 
 def test_each_option_changes_the_run(scene: Path, tmp_path: Path):
     out = tmp_path / "new" / "named.h5"
-    more = (
-        "--error",
-        "1e-6",
-        "--frames",
-        "2",
-        "--set",
-        "cages.count=80",
-        "--set",
-        "output.surface=true",
-    )
-    on(1, "-ksp_max_it", "400", scene, "-o", out, "--preset", "newton", *more, status=0)
+    more = "--preset newton --error 1e-6 --frames 2 --set cages.count=80 --set output.surface=true"
+    on(1, "-ksp_max_it", "400", scene, "-o", out, *more.split(), status=0)
     with h5py.File(out) as file:
         as_run = tomllib.loads(file.attrs["scene"])
         assert as_run["solver"] == {"preset": "newton", "error": 1e-6}
@@ -114,26 +101,11 @@ def test_each_option_changes_the_run(scene: Path, tmp_path: Path):
 
 
 def test_petsc_options_of_the_user_work_on_two_ranks(scene: Path, tmp_path: Path):
-    done = on(
-        2,
-        scene,
-        "-o",
-        tmp_path / "o.h5",
-        "-ksp_type",
-        "pipecg",
-        "-ksp_view",
-        "-log_view",
-        "--frames",
-        "1",
-        status=0,
-    )
+    words = "-ksp_type pipecg -ksp_view -log_view --frames 1"
+    done = on(2, scene, "-o", tmp_path / "o.h5", *words.split(), status=0)
     assert "type: pipecg" in done.stdout and "type: cg\n" not in done.stdout
     assert done.stdout.count("PETSc Performance Summary") == 1
-    stages = [
-        line.split(": ")[1]
-        for line in done.stdout.splitlines()
-        if line.startswith("--- Event Stage")
-    ]
+    stages = re.findall(r"^--- Event Stage .*?: (.*)", done.stdout, re.M)
     # PETSc 3.22 lists all stages
     assert {"Main Stage", "set-up", "steps", "output"} <= set(stages) and "Unknown" not in stages
 
@@ -185,10 +157,7 @@ def test_an_unused_option_of_a_name_that_solving_might_read_is_told_at_the_end(
     done = on(1, scene, "-o", tmp_path / "o.h5", "--frames", "1", "-npc_ksp_view")
     assert_one_line(done, 2, "-npc_ksp_view")
     # the frames computed before the failure are complete
-    assert sorted(p.name for p in tmp_path.iterdir()) == [
-        "o.h5",
-        "o.xdmf",
-    ]
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["o.h5", "o.xdmf"]
 
 
 def test_a_preconditioner_that_ranks_do_not_share_is_refused(scene: Path, tmp_path: Path):
@@ -252,12 +221,9 @@ def test_nothing_is_left_of_refused_runs(folder: Path, refusals: dict):
 
 
 def test_what_is_odd_but_can_be_simulated_is(scene: Path, tmp_path: Path):
-    done = on(
-        1, scene, "-o", tmp_path / "o.h5", "--frames", "1", *mesh("open.ply", "pin=[]"), status=0
-    )
-    (warning,) = [
-        line for line in done.stderr.splitlines() if line.startswith("msmpetsc: warning:")
-    ]
+    words = ["--frames", "1", *mesh("open.ply", "pin=[]")]
+    done = on(1, scene, "-o", tmp_path / "o.h5", *words, status=0)
+    (warning,) = re.findall(r"^msmpetsc: warning: .*", done.stderr, re.M)
     assert "14 boundary edges" in warning
 
 
@@ -275,19 +241,8 @@ def test_a_step_that_does_not_converge_leaves_the_frames_before_it(
     out = tmp_path / "o.h5"
     force = "force.0={region={sphere={center=[0,0,-1],radius=1}},total=[1e4,0,0],start=0.025}"
     at_rest = sets("gravity.acceleration=[0,0,0]", force, "time.duration=0.05")
-    done = on(
-        ranks,
-        scene,
-        "-o",
-        out,
-        *at_rest,
-        "--preset",
-        preset,
-        "--error",
-        "1e-12",
-        "-snes_max_it",
-        "1",
-    )
+    words = f"--preset {preset} --error 1e-12 -snes_max_it 1".split()
+    done = on(ranks, scene, "-o", out, *at_rest, *words)
     assert_one_line(done, 3, "frame 3 ", "DIVERGED_MAX_IT", "residual", "try ")
     with h5py.File(out) as file:
         assert finished(file) == 3 and np.isfinite(file["frames/position"][:3]).all()

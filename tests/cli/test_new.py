@@ -95,10 +95,8 @@ def test_what_cannot_be_written_is_refused_in_one_line(tmp_path: Path, ball: Pat
         assert words in command_error(*command)
     assert sorted(os.listdir()) == ["ball.ply", "flat.ply"]
     Path("my.toml").write_text("mine")
-    assert (
-        status_of("new", "my.toml", "--mesh", "ball.ply") == 2
-        and Path("my.toml").read_text() == "mine"
-    )
+    assert status_of("new", "my.toml", "--mesh", "ball.ply") == 2
+    assert Path("my.toml").read_text() == "mine"
     assert status_of("new", "my.toml", "--mesh", "ball.ply", "--overwrite") == 0
 
 
@@ -155,13 +153,8 @@ def test_commands_that_are_shown_can_be_pasted(tmp_path: Path, capsys):
     command = capsys.readouterr().out.splitlines()[-1].removeprefix("to run it: ")
     assert shlex.split(command) == ["msmpetsc", "run", str(scene), "--picture"]
     told = command_error("run", mesh, "-o", tmp_path / "x.h5").partition("no scene: ")[2]
-    assert shlex.split(told) == [
-        "msmpetsc",
-        "new",
-        str(mesh.with_suffix(".toml")),
-        "--mesh",
-        str(mesh),
-    ]
+    own = str(mesh.with_suffix(".toml"))
+    assert shlex.split(told) == ["msmpetsc", "new", own, "--mesh", str(mesh)]
     told = command_error("study", scene).partition("no study: ")[2]
     assert shlex.split(told) == ["msmpetsc", "run", str(scene)]
     told = (

@@ -3,7 +3,8 @@
 import h5py
 import numpy as np
 import pytest
-from conftest import ROOT, run
+from conftest import ROOT
+from one_process import status_of
 
 pytest.importorskip("pymeshfix", reason="the bunny comes with pymeshfix")
 
@@ -15,27 +16,8 @@ def fall(tmp_path_factory: pytest.TempPathFactory) -> h5py.File:
     """Run the shipped scene at its own time step until it has struck the ground, solved tightly."""
     path = tmp_path_factory.mktemp("runs") / "fall.h5"
     # cells of 23 mm
-    words = (
-        "--set",
-        "cages.count=600",
-        "--preset",
-        "newton",
-        "--error",
-        "1e-9",
-        "--frames",
-        125,
-    )
-    run(
-        1,
-        "-m",
-        "msmpetsc",
-        "run",
-        ROOT / "scenes" / "bunny_fall.toml",
-        "-o",
-        path,
-        *words,
-        status=0,
-    )
+    words = "--set cages.count=600 --preset newton --error 1e-9 --frames 125"
+    assert status_of("run", ROOT / "scenes" / "bunny_fall.toml", "-o", path, *words.split()) == 0
     return h5py.File(path)
 
 

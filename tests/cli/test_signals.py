@@ -19,11 +19,10 @@ from stopped_runs import (  # noqa: F401  # a fixture
     every_step_forgets,
     hanging,
     ranks_of,
-    signal_after,
+    stopped_after,
 )  # fmt: skip
 
 from msmpetsc.app import running
-from msmpetsc.cli.main import main
 from msmpetsc.results.untrusted_file import finished
 
 STATUS = {signal.SIGUSR1: 0, signal.SIGTERM: 143, signal.SIGINT: 130}
@@ -38,14 +37,11 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("number", STATUS)
-def test_a_signal_ends_the_step_and_the_run_goes_on_exactly(
-    whole: Path, tmp_path, monkeypatch, capsys, number
-):
+def test_a_signal_ends_the_step_and_the_run_goes_on_exactly(whole: Path, tmp_path, capsys, number):
     path, handler = tmp_path / "x.h5", signal.getsignal(number)
-    with monkeypatch.context() as patch:
-        # the signal comes between frames
-        signal_after(patch, 10, number)
-        assert status_of("run", whole.parent / "scene.toml", "-o", path) == STATUS[number]
+    # the signal comes between frames
+    command = "run", whole.parent / "scene.toml", "-o", path
+    assert stopped_after(10, *command, number=number) == STATUS[number]
     told = (
         f"stopped by {number.name} after step 10 of 40 (t = 0.1 s); to go on: msmpetsc run "
         f"--resume {path}\n"
@@ -59,29 +55,22 @@ def test_a_signal_ends_the_step_and_the_run_goes_on_exactly(
     assert sorted(os.listdir(tmp_path)) == ["x.h5", "x.xdmf"]
 
 
-def test_stopped_again_and_again(whole: Path, tmp_path, monkeypatch):
+def test_stopped_again_and_again(whole: Path, tmp_path):
     path = tmp_path / "x.h5"
     # each command is the same
-    arguments = [
-        "run",
-        str(whole.parent / "scene.toml"),
-        "--resume",
-        str(path),
-    ]
+    arguments = "run", whole.parent / "scene.toml", "--resume", path
     for step in (0, 1, 7, 8, 27, 39):
-        with monkeypatch.context() as patch:
-            signal_after(patch, step, signal.SIGUSR1)
-            assert main(arguments) == 0
+        assert stopped_after(step, *arguments) == 0
         with h5py.File(path) as file:
             assert finished(file) == 1 + step // EVERY and max(file["checkpoint/step"]) == step
-    assert main(arguments) == 0
+    assert status_of(*arguments) == 0
     assert_same(path, whole)
 
 
-def test_a_signal_in_the_last_step_comes_too_late(whole: Path, tmp_path, monkeypatch, capsys):
-    signal_after(monkeypatch, STEPS, signal.SIGTERM)
+def test_a_signal_in_the_last_step_comes_too_late(whole: Path, tmp_path, capsys):
     path = tmp_path / "x.h5"
-    assert status_of("run", whole.parent / "scene.toml", "-o", path) == 0
+    command = "run", whole.parent / "scene.toml", "-o", path
+    assert stopped_after(STEPS, *command, number=signal.SIGTERM) == 0
     assert "stopped" not in capsys.readouterr().err
     assert_same(path, whole)
 
@@ -137,19 +126,10 @@ def test_a_signal_ends_a_step_of_minutes_between_its_iterations(tmp_path, ranks:
     scene = hanging(
         tmp_path, 2, cages={"cell_size": 1 / 32}, material={"young_modulus": 1e9, "density": 1000.0}
     )
-    endless = [
-        "-snes_type",
-        "nrichardson",
-        "-snes_linesearch_type",
-        "basic",
-        "-snes_max_it",
-        "100000",
-    ]
     seen = tmp_path / "iterations"
-    endless += ["-snes_monitor", f"ascii:{seen}"]
-    process = start(
-        scene, "-o", path, "--error", "1e-13", "--preset", "anderson", *endless, ranks=ranks
-    )
+    endless = "--error 1e-13 --preset anderson -snes_type nrichardson -snes_linesearch_type basic "
+    endless += f"-snes_max_it 100000 -snes_monitor ascii:{seen}"
+    process = start(scene, "-o", path, *endless.split(), ranks=ranks)
     with process:
         wait_until(lambda: seen.exists() and seen.stat().st_size)
         pid = process.pid if ranks == 1 else ranks_of(process)[-1]
@@ -160,17 +140,8 @@ def test_a_signal_ends_a_step_of_minutes_between_its_iterations(tmp_path, ranks:
     assert "stopped by SIGTERM after step 0 of 2 (t = 0 s); to go on: msmpetsc run --resume" in told
     with h5py.File(path) as file:
         assert finished(file) == 1 and max(file["checkpoint/step"]) == 0
-    able = [
-        "--preset",
-        "newton",
-        "--error",
-        "1e-3",
-        "-snes_type",
-        "newtonls",
-        "-snes_linesearch_type",
-        "bt",
-    ]
-    assert status_of("run", "--resume", path, "--force", *able) == 0
+    able = "--preset newton --error 1e-3 -snes_type newtonls -snes_linesearch_type bt"
+    assert status_of("run", "--resume", path, "--force", *able.split()) == 0
 
 
 def test_a_second_interrupt_stops_at_once(tmp_path):
@@ -179,11 +150,9 @@ def test_a_second_interrupt_stops_at_once(tmp_path):
     scene = hanging(
         tmp_path, 2, cages={"cell_size": 1 / 48}, solver={"preset": "paper", "error": 1e-9}
     )
-    endless, seen = (
-        ["-ksp_rtol", "1e-99", "-ksp_atol", "0", "-ksp_max_it", "100000"],
-        tmp_path / "iterations",
-    )
-    process = start(scene, "-o", path, *endless, "-ksp_monitor", f"ascii:{seen}")
+    seen = tmp_path / "iterations"
+    endless = f"-ksp_rtol 1e-99 -ksp_atol 0 -ksp_max_it 100000 -ksp_monitor ascii:{seen}"
+    process = start(scene, "-o", path, *endless.split())
     with process:
         # an interrupt before the first monitored iteration would end the run
         wait_until(lambda: seen.exists() and seen.stat().st_size)

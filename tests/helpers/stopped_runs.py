@@ -14,6 +14,7 @@ from block_scene import block_scene
 from mpi4py import MPI
 
 from msmpetsc.build import build_model
+from msmpetsc.cli.main import main
 from msmpetsc.fields import FRAME_FIELDS, Frame
 from msmpetsc.results.untrusted_file import finished
 from msmpetsc.scene.reading import load_scene
@@ -84,6 +85,13 @@ def at_step(
 def signal_after(monkeypatch: pytest.MonkeyPatch, step: int, number: signal.Signals) -> None:
     """Send the signal to this process when the run has taken that step."""
     at_step(monkeypatch, step, lambda: os.kill(os.getpid(), number), is_stored=False)
+
+
+def stopped_after(step: int, *words: object, number: signal.Signals = signal.SIGUSR1) -> int:
+    """Run a command, to which the signal comes after that step, and return its exit status."""
+    with pytest.MonkeyPatch.context() as patch:
+        signal_after(patch, step, number)
+        return main([*map(str, words)])
 
 
 def assert_equal(found: dict, expected: dict) -> None:

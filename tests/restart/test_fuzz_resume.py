@@ -1,13 +1,12 @@
 """Damaged and hostile result files: run --resume continues, or refuses in a line."""
 
-import signal
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 from one_process import command_error, status_of
-from stopped_runs import hanging, signal_after
+from stopped_runs import hanging, stopped_after
 
 from msmpetsc.solve import simulate
 
@@ -17,8 +16,7 @@ def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("stopped")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulate, "REMEMBERED", 4)
-        signal_after(patch, 4, signal.SIGUSR1)
-        assert status_of("run", hanging(folder, steps=6), "-o", folder / "x.h5") == 0
+        assert stopped_after(4, "run", hanging(folder, steps=6), "-o", folder / "x.h5") == 0
     return folder / "x.h5"
 
 

@@ -117,12 +117,8 @@ def test_inverted_cells_are_counted_and_told_with_their_place(
     first, last = (
         record.getMessage() for record in caplog.records if "inside out" in record.getMessage()
     )
-    assert (
-        first.startswith("frame 0 ")
-        and "32 cells" in first
-        and "neo-hookean" in first
-        and "in 7 frames" in last
-    )
+    assert first.startswith("frame 0 ") and "32 cells" in first and "neo-hookean" in first
+    assert "in 7 frames" in last
 
 
 def test_only_the_cell_that_is_turned_is_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture):
@@ -151,9 +147,8 @@ def test_a_budget_that_ends_far_off_is_told_once_and_summed_up(
     first, last = (
         record.getMessage() for record in caplog.records if "off " in record.getMessage()
     )
-    assert (
-        len(far) >= 2 and first.startswith(f"frame {far[0]} (") and f"in {len(far)} frames" in last
-    )
+    assert len(far) >= 2 and first.startswith(f"frame {far[0]} (")
+    assert f"in {len(far)} frames" in last
 
 
 def test_stop_is_the_default(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -173,10 +168,8 @@ def test_a_failed_step_is_halved_and_whole_steps_follow(
     """
     failing = Failing(monkeypatch, {3, 4})
     _, frames = play(beam(tmp_path), "safety.on_failure=substep")
-    assert (
-        of(frames, "substeps").tolist() == [0, 0, 0, 3, 2, 0, 0]
-        and not of(frames, "fallbacks").any()
-    )
+    assert of(frames, "substeps").tolist() == [0, 0, 0, 3, 2, 0, 0]
+    assert not of(frames, "fallbacks").any()
     assert failing.count == 2 + 1 + 1 + 3 + 2 + 1 + 1
 
 

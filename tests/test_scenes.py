@@ -58,10 +58,8 @@ class Result:
             self.most = (self.kinetic + file["frames/elastic"][:]).max()
             points, self.surface = file["surface/points"][:], file["frames/surface"][:]
             self.body = points, file["surface/triangles"][:].astype(np.int64)
-            self.contacts, self.nearest = (
-                file["frames/self_contacts"][:],
-                file["frames/self_distance"][:],
-            )
+            self.contacts = file["frames/self_contacts"][:]
+            self.nearest = file["frames/self_distance"][:]
         self.h = np.ptp(self.nodes[self.cells[0]], axis=0).max()
         self.bounds = np.array([points.min(axis=0), points.max(axis=0)])
         self.height = np.ptp(self.bounds, axis=0)[2]

@@ -21,10 +21,8 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = block_scene(
         folder, **fall, pin=[{"region": {"half_space": {"point": [0, 0, 0], "normal": [0, 0, -1]}}}]
     )
-    assert (
-        status_of("check", "--update", path, "--frames", STEPS, "--set", "material.density=900.0")
-        == 0
-    )
+    words = "--frames", STEPS, "--set", "material.density=900.0"
+    assert status_of("check", "--update", path, *words) == 0
     return path
 
 

@@ -179,11 +179,8 @@ def test_a_probe_that_dies_is_broken_in_one_line():
 
 
 def test_what_a_program_reads_is_one_json_object(tmp_path: Path, capsys):
-    scene = str(
-        block_scene(
-            tmp_path, time={"step": 0.01, "duration": 0.02}, gravity={"acceleration": [0, 0, -1]}
-        )
-    )
+    time, gravity = {"step": 0.01, "duration": 0.02}, {"acceleration": [0, 0, -1]}
+    scene = str(block_scene(tmp_path, time=time, gravity=gravity))
     files = [str(tmp_path / f"{name}.h5") for name in "ab"]
     for file, frames in zip(files, "21", strict=True):
         assert status_of("run", scene, "-o", file, "--frames", frames, "--quiet") == 0

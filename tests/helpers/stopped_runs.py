@@ -38,14 +38,9 @@ def hanging(folder: Path, steps: int = STEPS, **tables) -> Path:
     material = {"young_modulus": 1e5, "density": 1000.0}
     output = {"surface": True, "every": EVERY}
     gravity = {"acceleration": [0.0, 1.0, -9.81]}
-    scene = dict(
-        gravity=gravity,
-        pin=side,
-        time={"step": 0.01, "duration": 0.01 * steps},
-        material=material,
-        output=output,
-    )
-    return block_scene(folder, **scene | {"solver": {"preset": "newton", "error": 1e-3}} | tables)
+    time, solver = {"step": 0.01, "duration": 0.01 * steps}, {"preset": "newton", "error": 1e-3}
+    scene = dict(gravity=gravity, pin=side, time=time, material=material, output=output)
+    return block_scene(folder, **scene | {"solver": solver} | tables)
 
 
 def assert_same(path: Path, whole: Path, rtol: float = 0.0) -> None:
@@ -120,13 +115,8 @@ def assert_goes_on_exactly(path: Path, every: int) -> list[Frame | None]:
                 frames.append(frame)
                 saved.append(copy.deepcopy(simulation.saved))
         count = len(saved)
-        begins = {
-            every,
-            2 * every,
-            4 * every,
-            count // 2 // every * every,
-            (count - 2) // every * every,
-        }
+        begins = {every, 2 * every, 4 * every}
+        begins |= {step // every * every for step in (count // 2, count - 2)}
         for begin in begins & {*range(1, count - 1)}:
             with TimeLoop(comm, scene, model) as simulation:
                 simulation.restore(saved[begin])

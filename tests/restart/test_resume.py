@@ -261,10 +261,8 @@ def test_frames_after_the_checkpoint_are_kept_as_they_are(whole: Path, tmp_path,
 )
 def test_checkpoints_come_as_often_as_asked_and_at_the_end(whole: Path, tmp_path, every, steps):
     path = tmp_path / "x.h5"
-    assert (
-        status_of("run", whole.with_name("scene.toml"), "-o", path, "--checkpoint-every", every)
-        == 0
-    )
+    words = "-o", path, "--checkpoint-every", every
+    assert status_of("run", whole.with_name("scene.toml"), *words) == 0
     with h5py.File(path) as file:
         assert set(file["checkpoint/step"]) <= steps and max(file["checkpoint/step"]) == STEPS
 

@@ -24,11 +24,7 @@ def test_all_tables_and_keys_are_listed():
 
 def test_default_range_and_meaning_are_those_of_the_schema():
     density = key("material.density")
-    assert (density.default, density.bounds, density.about) == (
-        "required",
-        "> 0",
-        "mass density [kg/m^3]",
-    )
+    assert density == ("material.density", "required", "> 0", "mass density [kg/m^3]")
     assert key("time.error").bounds == "> 0, < 1"
     assert key("cages.boundary").bounds == "fill | whole"
     assert key("cages.boundary").default == '"fill"'

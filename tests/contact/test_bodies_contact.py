@@ -148,8 +148,8 @@ def test_a_way_is_cut_where_pairs_are_known_at_its_end_alone(folder: Path):
     start = model.lattice.nodes.copy()
     end = start - np.where(model.lattice.body[:, None] == 1, [0, 0, 0.02 + 2.5 * SIDE], 0.0)
     contacts = ContactSearch(CandidateCache(MPI.COMM_SELF, model.collision), 0.0, 0.01)
-    contacts.find(start, with_points=True)
-    contacts.find(end, with_points=True)
+    contacts.find(start)
+    contacts.find(end)
     free = 0.02 / (0.02 + 2.5 * SIDE)
     # collision detection keeps a tenth of the collision-free path as distance
     assert 0.75 * free < contacts.collision_free_step(start, end) < free

@@ -114,17 +114,6 @@ def test_the_derivatives_in_a_crease_are_those_of_its_energy():
     assert 0 < barrier.least(barrier.contacts(candidates, points), points) < DISTANCE / 4
 
 
-def test_walls_are_clear_as_long_as_they_cannot_come_near():
-    barrier, points, _ = barrier_of()
-    candidates, reach = barrier.candidates(points, 0.0), 0.2
-    clear = barrier.clear_margin(candidates, points, reach)
-    assert 0 < clear < reach
-    for seed in range(10):
-        way = np.random.default_rng(seed).normal(size=points.shape)
-        moved = points + 0.999 * clear * way / np.linalg.norm(way, axis=1)[:, None]
-        assert all(pairs.empty() for pairs in barrier.contacts(candidates, moved))
-
-
 def test_walls_that_all_but_touch_are_left_out_and_counted():
     # the walls are nearer than a thousandth of the distance
     assert barrier_of(half=0.4e-3 * DISTANCE)[2] > 0

@@ -233,19 +233,6 @@ class Barrier:
             )
         return tuple(map(CandidateSet, sets))
 
-    def clear_margin(self, sets: CandidateSets, points: Positions, margin: float) -> float:
-        """Return the displacement [m] of points, at most ``margin``, below which no pair pushes.
-
-        The result is 0 if a pair pushes already.
-        """
-        for pairs, distance in zip(sets, self.distances, strict=True):
-            near = self.ipctk.NormalCollisions()
-            limit = distance + 2 * margin
-            near.build(pairs.candidates, self.mesh, np.asfortranarray(points), limit)
-            if not near.empty():
-                margin = min(margin, max(0.5 * (self._least(near, points) - distance), 0.0))
-        return margin
-
     def contacts(self, sets: CandidateSets, points: Positions) -> ContactSets:
         """Return the pairs that push at points (p, 3) [m]."""
         kinds = zip(sets, self.distances, strict=True)
@@ -321,12 +308,9 @@ class Barrier:
 
     def least(self, contacts: ContactSets, points: Positions) -> float:
         """Return the least distance [m] of contacts; infinite without contacts."""
-        return min(
-            (self._least(pairs, points) for _, pairs in self._pushing(contacts)), default=np.inf
-        )
-
-    def _least(self, pairs: "ipctk.NormalCollisions", points: Positions) -> float:
-        return float(np.sqrt(pairs.compute_minimum_distance(self.mesh, np.asfortranarray(points))))
+        at = self.mesh, np.asfortranarray(points)
+        squares = [pairs.compute_minimum_distance(*at) for _, pairs in self._pushing(contacts)]
+        return float(np.sqrt(min(squares, default=np.inf)))
 
     def nearest(self, contacts: ContactSets, points: Positions) -> Indices:
         """Return the numbers (k,) of the closest pair's points; empty without contacts."""
@@ -335,13 +319,3 @@ class Barrier:
         nearest = min(pairs, key=lambda pair: pair.compute_distance(at, *parts), default=None)
         numbers = [] if nearest is None else [i for i in nearest.vertex_ids(*parts) if i >= 0]
         return np.array(numbers, np.int64)
-
-    def clearance(self, contacts: ContactSets, sets: CandidateSets, points: Positions) -> float:
-        """Return a lower bound [m] of the distances of candidate pairs at points S (p, 3) [m]."""
-        known = zip(contacts, sets, self.distances, strict=True)
-        least = (
-            self._least(near, points) if len(near) else far
-            for near, pairs, far in known
-            if len(near) + len(pairs)
-        )
-        return min(least, default=self.law.distance)

@@ -68,18 +68,12 @@ class ObstacleSurfaces:
     def _posed(self, poses: Sequence[Floats]) -> Positions:
         """Return the points (o, 3) [m] with each obstacle in a pose of its path."""
         posed = zip(self.obstacles, self.solids, poses, strict=True)
-        return np.concatenate([each.path.moved(solid.points, pose) for each, solid, pose in posed])
+        points = [each.path.moved(solid.points, pose) for each, solid, pose in posed]
+        return np.concatenate([np.empty((0, 3)), *points])
 
     def displacements(self, begin: float, end: float) -> Rows:
-        """Return the points' displacements (o, 3) [m] between two times [s]; (1, 3) zeros at rest.
-
-        Obstacles are at rest if none moves between the times.
-        """
-        return (
-            self.points_at(end) - self.points_at(begin)
-            if self.moves(begin, end)
-            else np.zeros((1, 3))
-        )
+        """Return the points' displacements (o, 3) [m] between two times [s]."""
+        return self.points_at(end) - self.points_at(begin)
 
     def displacements_before(self, begin: float, end: float) -> Rows:
         """Return displacements (o, 3) [m] in a step before ``begin``, extrapolated from the step.

@@ -1,9 +1,7 @@
 """Candidate contact pairs of a surface, cached so that the broad phase runs rarely.
 
 The broad phase finds candidate pairs at given positions. The pairs are valid until a point has
-moved by more than a margin; a translation of all points does not count. A bound from displacements
-of nodes is tested first. If it shows that no pair can push, the points are not computed. Otherwise
-displacements of points decide, since light nodes around a body swing much farther than its points.
+moved by more than a margin; a translation of all points does not count.
 
 Candidate pairs outlive a step (``CandidateCache``). Contacts at positions are kept during a step
 (``ContactSearch``). If few points touch, a step is narrow: it uses the candidates around these
@@ -36,7 +34,6 @@ FARTHEST = 0.05
 FEW = 0.01
 # Relative difference of two sums of contact energy that counts as rounding [-]
 SAME_ENERGY = 1e-9
-TINY = np.finfo(float).tiny
 
 
 @dataclass(frozen=True)
@@ -77,19 +74,13 @@ class CandidatePairs:
 
     A translation of all points does not count.
 
-    q      : positions (owned, 3) [m] of the broad phase
-    time   : time [s] of the obstacles' places
     margin : greatest displacement of a point [m]
-    clear  : displacement [m], at most the margin, below which no pair pushes
-    points : S (p, 3) [m] at q, on rank 0
+    points : S (p, 3) [m] of the broad phase, on rank 0
     sets   : candidate pairs, on rank 0
     moved  : straight paths (p, 3) [m] of the points, on rank 0; None if points stay
     """
 
-    q: Positions
-    time: float
     margin: float
-    clear: float
     points: Positions
     sets: CandidateSets
     moved: Rows | None = None
@@ -99,7 +90,8 @@ class CandidatePairs:
         gone = points - self.points
         if self.moved is not None:
             gone, path = gone - gone.mean(axis=0), self.moved - self.moved.mean(axis=0)
-            gone -= np.clip(np.vdot(gone, path) / (np.vdot(path, path) + TINY), 0.0, 1.0) * path
+            square = max(np.vdot(path, path), np.finfo(float).tiny)
+            gone -= np.clip(np.vdot(gone, path) / square, 0.0, 1.0) * path
         return farthest(gone) <= self.margin
 
 
@@ -110,8 +102,8 @@ class SurfaceContactsAt:
     q        : (owned, 3) positions [m]
     time     : time [s] of the obstacles' places
     count    : number of contacts
-    points   : S (p, 3) [m], on rank 0; empty if nothing is near
-    contacts : the pairs that push, on rank 0; empty if nothing is near
+    points   : S (p, 3) [m], on rank 0
+    contacts : the pairs that push, on rank 0
     """
 
     q: Positions
@@ -141,10 +133,6 @@ class CandidateCache:
         # The newest first
         self._known: list[CandidatePairs] = []
 
-    def around(self, q: Positions, time: float) -> CandidatePairs:
-        """Return the newest candidates; if there are none yet, find candidates at q."""
-        return self._known[0] if self._known else self.broad_phase(q, time)
-
     def valid_at(self, *places: Positions) -> CandidatePairs | None:
         """Return the newest candidates that are valid at all ``places``, or None.
 
@@ -159,38 +147,13 @@ class CandidateCache:
         self._known.insert(0, self._known.pop(number))
         return self._known[0]
 
-    def broad_phase(self, q: Positions, time: float, moved: Rows | None = None) -> CandidatePairs:
-        """Find candidate pairs at q, or on paths from q by ``moved`` (p, 3) [m], and cache them."""
-        points, margin = self.points(q, time), REACH * self.edge
-        sets: CandidateSets = ()
-        clear = 0.0
-        if self.barrier:
-            sets = self.barrier.candidates(points, margin, moved)
-            clear = self.barrier.clear_margin(sets, points, margin) if moved is None else 0.0
-        newest = CandidatePairs(
-            q[: self.owned].copy(), time, margin, self.comm.bcast(clear), points, sets, moved
-        )
+    def broad_phase(self, points: Positions, moved: Rows | None = None) -> CandidatePairs:
+        """Find and cache candidate pairs at points (p, 3) [m], or on their paths by ``moved``."""
+        margin = REACH * self.edge
+        sets = self.barrier.candidates(points, margin, moved) if self.barrier else ()
+        newest = CandidatePairs(margin, points, sets, moved)
         self._known = [newest, *self._known[: REMEMBERED - 1]]
         return newest
-
-    def farthest(self, end: Positions, start: Positions, time: float, begin: float) -> float:
-        """Return a bound [m] of points' displacements from start to end, without a translation.
-
-        begin, time : times [s] of the obstacles at start and end
-        """
-        moved = end[: self.owned] - start[: self.owned]
-        if self.points.obstacles.total:
-            moved = np.vstack([moved, self.points.obstacles.displacements(begin, time)])
-        # numpy reduces fastest along the last axis
-        along = np.ascontiguousarray(moved.T)
-        ends = [
-            np.fmax.reduce(along, axis=1, initial=-np.inf),
-            -np.fmin.reduce(along, axis=1, initial=np.inf),
-        ]
-        ends = np.concatenate(ends)
-        # Greatest displacements along the axes and against them
-        self.comm.Allreduce(MPI.IN_PLACE, ends, MPI.MAX)
-        return float(self.points.spread * 0.5 * np.linalg.norm(ends[:3] + ends[3:]))
 
     def forget(self) -> None:
         """Forget all candidates, so that the next step does not depend on earlier steps."""
@@ -225,29 +188,18 @@ class ContactSearch:
         # q, time and points of the last positions
         self._points: list[tuple[Positions, float, Positions]] = before._points if before else []
 
-    def find(
-        self,
-        q: Positions,
-        time: float | None = None,
-        with_points: bool = False,
-    ) -> SurfaceContactsAt:
+    def find(self, q: Positions, time: float | None = None) -> SurfaceContactsAt:
         """Return the contacts at positions q.
 
-        time        : time [s] of obstacles; None for the end of the step
-        with_points : compute the points even if nothing is near
+        time : time [s] of obstacles; None for the end of the step
         """
         q, time = q[: self.owned], self.time if time is None else time
         for moment in self._moments:
             if self._is_at(moment.q, moment.time, q, time):
                 return moment
-        pairs = self.near.around(q, time)
-        bound = self.near.farthest(q, pairs.q, time, pairs.time)
-        if bound < pairs.clear and not with_points:
-            return SurfaceContactsAt(q, time, 0, np.empty((0, 3)), ())
-        points = self.points_at(q, time)
-        if bound > pairs.margin and not self.is_narrow:
-            pairs = self.near.valid_at(points) or self.near.broad_phase(q, time)
-        sets = self._around if self.is_narrow else pairs.sets
+        points, sets = self.points_at(q, time), self._around
+        if not self.is_narrow:
+            sets = (self.near.valid_at(points) or self.near.broad_phase(points)).sets
         contacts = self.barrier.contacts(sets, points) if self.barrier else ()
         count = self.comm.bcast(sum(map(len, contacts)))
         self._moments = [
@@ -329,7 +281,7 @@ class ContactSearch:
 
     def nearest(self, q: Positions) -> str:
         """Return a text that names the two nearest parts of the surface at q, and their place."""
-        moment, words = self.find(q, with_points=True), ""
+        moment, words = self.find(q), ""
         if self.barrier:
             points = self.barrier.nearest(moment.contacts, moment.points)
             names = dict.fromkeys(self.near.name_of(point) for point in points)
@@ -342,15 +294,6 @@ class ContactSearch:
         in_words: str = self.comm.bcast(words)
         return in_words
 
-    def _bound(self, q: Positions, begin: float, end: Positions) -> tuple[CandidatePairs, float]:
-        """Return the newest candidates and a bound [m] of points' distances from their places.
-
-        The bound holds on the whole path from q at ``begin`` [s] to ``end``.
-        """
-        pairs = self.near.around(q, begin)
-        places = (q, begin), (end, self.time)
-        return pairs, max(self.near.farthest(at, pairs.q, time, pairs.time) for at, time in places)
-
     def collision_free_step(
         self, q: Positions, end: Positions, begin: float | None = None
     ) -> float:
@@ -359,36 +302,22 @@ class ContactSearch:
         begin : time [s] from which obstacles move to their present places; None if they stay
         """
         begin = self.time if begin is None else begin
-        pairs, bound = self._bound(q, begin, end)
-        if bound < pairs.clear:
-            return 1.0
         start = self.points_at(q, begin)
-        moved = self.points_at(end, self.time) - start
-        length = self.comm.bcast(farthest(moved) if self.barrier else 0.0)
-        if 2 * length < self.law.distance and 2 * length < self._clearance(q, begin):
-            return 1.0
-        sets = self._around
+        moved, sets = self.points_at(end, self.time) - start, self._around
         if not self.is_narrow:
             # Candidates must be valid at both ends of the path
             known = self.near.valid_at(start, start + moved)
+            length = self.comm.bcast(farthest(moved) if self.barrier else 0.0)
             if not known and length > PIECE * self.near.edge:
                 return float(
                     self.comm.bcast(sweep(self.barrier, start, moved) if self.barrier else 1.0)
                 )
-            sets = (known or self.near.broad_phase(q, begin, moved)).sets
+            sets = (known or self.near.broad_phase(start, moved)).sets
         return float(
             self.comm.bcast(
                 collision_free_step(self.barrier, start, moved, sets) if self.barrier else 1.0
             )
         )
-
-    def _clearance(self, q: Positions, time: float) -> float:
-        """Return the least distance [m] of pairs at q and a time [s], at most dhat."""
-        moment, clearance = self.find(q, time, with_points=True), 0.0
-        if self.barrier:
-            sets = self._around if self.is_narrow else self.barrier.creases
-            clearance = self.barrier.clearance(moment.contacts, sets, moment.points)
-        return float(self.comm.bcast(clearance))
 
 
 def farthest(moved: Rows) -> float:

@@ -17,7 +17,6 @@ from msmpetsc.comm import reduced
 from msmpetsc.contact.surface.pairs import ContactSearch, SurfaceContactsAt
 from msmpetsc.contact.surface.surface_friction import SurfaceFriction
 
-TINY = np.finfo(float).tiny
 # Displacement below which a change of energy is the mean force times the displacement
 # [dhat]; a difference of energies would lose its digits
 SMALL = 1e-4
@@ -172,7 +171,7 @@ class SurfaceContact:
 
     def _acting(self, q: Positions) -> SurfaceContactsAt | None:
         """Return the contacts at q, with points for friction; None if nothing acts."""
-        moment = self.contacts.find(q, with_points=self.has_friction)
+        moment = self.contacts.find(q)
         return moment if moment.count or self.has_friction else None
 
     def presses(self, q: Positions) -> bool:
@@ -397,4 +396,6 @@ class SurfaceContact:
         if hessian is None:
             return np.zeros(self.contacts.owned)
         norms = np.abs(hessian.blocks).reshape(-1, 3, 3).sum(axis=2).max(axis=1)
-        return np.where(norms > 0, 4.0 ** np.ceil(np.log2(np.maximum(norms, TINY)) / 2), 0.0)
+        with np.errstate(divide="ignore"):
+            bound: Floats = 4.0 ** np.ceil(np.log2(norms) / 2)
+        return bound

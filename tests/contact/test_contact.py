@@ -350,14 +350,14 @@ def test_friction_goes_on_from_the_slip_that_the_last_step_ended_with():
     first = ground.during(start, T, T)
     # the first node sticks, the second slips
     end = start + stick * np.array([[0.3, 0, 0], [5.0, 0, 0]])
-    then = ground.during(end, 2 * T, T).after([first], end)
+    then = ground.during(end, 2 * T, T, before=[first])
     u, _ = then.friction.slip(end)
     np.testing.assert_allclose(u, stick * np.array([[0.3, 0, 0], [1, 0, 0]]), atol=1e-15)
     back = end - u
     assert then.friction.released(end) == pytest.approx(0, abs=1e-18)
     assert then.friction.released(back) == pytest.approx(then.friction.change(end, back), rel=1e-9)
     # a shorter step with the same force
-    shorter = ground.during(end, 1.5 * T, T / 2).after([first], end)
+    shorter = ground.during(end, 1.5 * T, T / 2, before=[first])
     np.testing.assert_allclose(shorter.friction.force(end), then.friction.force(end), rtol=1e-9)
 
 

@@ -30,14 +30,10 @@ class NodeFriction(Friction):
     normal: Rows
     carried: Positions
 
-    def after(self, last: "NodeFriction | None", q: Positions) -> "NodeFriction":
-        """Return the friction that begins with the last step's elastic slips, at q (owned, 3) [m].
-
-        last : friction of the last step; None without it
-        """
+    def after(self, last: "NodeFriction", q: Positions) -> "NodeFriction":
+        """Return the friction that begins with the last step's elastic slips, at q (owned, 3)."""
         slips = np.zeros_like(q)
-        if last:
-            slips[last.nodes] = last.elastic_slip(q, self.stick)
+        slips[last.nodes] = last.elastic_slip(q, self.stick)
         return replace(self, begin=self._tangential(slips[self.nodes]))
 
     def along(self, moved: Rows) -> Rows:

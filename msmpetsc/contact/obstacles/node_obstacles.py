@@ -74,10 +74,9 @@ class NodeObstacles:
 
     def push(self, time: float, sides: Indices | None) -> StepContact | None:
         """Return the penalty contact at a time, without friction; None if no penalty acts."""
-        states = [
-            p.state_at(time, side[: self.lattice.owned]) for p, side in self._pressing(time, sides)
-        ]
-        return StepContact(states, self.lattice.owned) if states else None
+        owned = self.lattice.owned
+        states = [ObstacleContact(p, time, side[:owned]) for p, side in self._pressing(time, sides)]
+        return StepContact(states, owned) if states else None
 
     def during(
         self,
@@ -96,18 +95,13 @@ class NodeObstacles:
         step   : time of the step's end, and its length [s]
         before : contact of the last step, whose elastic slips continue; None without it
         """
-        time, time_step = step
         owned = self.lattice.owned
-        states = []
-        states_before = before.states if before else []
         ended = None if end is None else end[:owned]
-        for p, side in self._pressing(time, sides):
-            states.append(
-                p.during(q[:owned], time, time_step, side[:owned], last, ended).after(
-                    states_before, q[:owned]
-                )
-            )
-        return states
+        states = before.states if before else []
+        return [
+            p.during(q[:owned], *step, side[:owned], last, ended, states)
+            for p, side in self._pressing(step[0], sides)
+        ]
 
     def contact_stiffness_bound(
         self, q: Positions, speed: float, start: float, time: float, sides: Indices
@@ -136,7 +130,7 @@ class NodeObstacles:
         begin, end : times [s] of the substep
         """
         new = [
-            p.state_at(end, side)
+            ObstacleContact(p, end, side)
             for p, side in self._pressing(end, sides)
             if not p.obstacle.acts_at(begin)
         ]
@@ -200,7 +194,7 @@ class NodeObstacles:
         """Return the depths (owned,) [m] of nodes in a penalty's obstacle; 0 outside."""
         q, sides = state
         side = (self.no_sides if sides is None else sides)[row, : len(q)]
-        return np.maximum(self.penalties[row].state_at(time, side).depths(q)[0], 0)
+        return np.maximum(self.penalties[row].obstacle.depths(q, time, side)[0], 0)
 
     def _pressing(self, time: float, sides: Indices | None) -> list[tuple[Penalty, Indices]]:
         sides = (self.no_sides if sides is None else sides)[self.pressing]

@@ -11,6 +11,7 @@ face, even beyond the opposite face, so a node that passes a plate in a step is 
 a side, depth is measured from the nearest face.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -56,10 +57,6 @@ class Penalty:
         restitution = None if table.restitution == 1 else table.restitution
         return cls(obstacle, stiffness, table.friction or 0.0, stick, restitution)
 
-    def state_at(self, time: float, sides: Indices | None = None) -> "ObstacleContact":
-        """Return the contact at a time [s] without friction, for ``sides`` (owned or more,)."""
-        return ObstacleContact(self, time, sides)
-
     def during(
         self,
         q: Positions,
@@ -68,20 +65,22 @@ class Penalty:
         sides: Indices | None = None,
         last: Positions | None = None,
         end: Positions | None = None,
+        before: "Sequence[ObstacleContact]" = (),
     ) -> "ObstacleContact":
         """Return the contact in the step that ends at ``time`` [s] and begins at q (owned, 3) [m].
 
-        last : (owned or more, 3) positions a step before q [m], for a step of BDF2. Friction then
-               uses the velocity and the extrapolated normal force at the step's end.
-        end  : (owned, 3) end positions of an earlier solve of the step [m], which then give the
-               normal force
+        last   : (owned or more, 3) positions a step before q [m], for a step of BDF2. Friction then
+                 uses the velocity and the extrapolated normal force at the step's end.
+        end    : (owned, 3) end positions of an earlier solve of the step [m], which then give the
+                 normal force
+        before : contacts of the last step with all obstacles, whose elastic slips continue
         """
-        state = self.state_at(time, sides)
+        state = ObstacleContact(self, time, sides)
         if self.friction == 0:
             return state
         start = time - time_step
         if end is None:
-            nodes, depth, normal = self.state_at(start, sides).pressed(q)
+            nodes, depth, normal = replace(state, time=start).pressed(q)
         else:
             nodes, depth, normal = state.pressed(end)
         displacement = like(q, self.obstacle.path.displacement_between(start, time))
@@ -98,7 +97,8 @@ class Penalty:
         limit = self.friction * self.stiffness * depth
         begin = np.zeros((1, 3), like=q)
         friction = NodeFriction(limit, stick, begin, nodes, normal, carried)
-        return replace(state, friction=friction)
+        ended = next((contact.friction for contact in before if contact.penalty is self), None)
+        return replace(state, friction=friction.after(ended, q) if ended else friction)
 
 
 @dataclass(frozen=True)
@@ -113,14 +113,6 @@ class ObstacleContact:
     time: float
     sides: Indices | None
     friction: NodeFriction | None = None
-
-    def after(self, before: "list[ObstacleContact]", q: Positions) -> "ObstacleContact":
-        """Return the contact that continues the elastic slips of ``before`` at q (owned, 3) [m].
-
-        before : contacts of the last step with all obstacles
-        """
-        last = next((state.friction for state in before if state.penalty is self.penalty), None)
-        return replace(self, friction=self.friction.after(last, q)) if self.friction else self
 
     def friction_limits(self, q: Positions) -> Floats:
         """Return the sums of mu N [N], (2,): as friction uses it, and at q (owned, 3)."""

@@ -15,8 +15,6 @@ from msmpetsc.geometry.surface import Surface
 
 # grid points per axis for the surface of a function [-]; for pictures only
 POINTS = 65
-# margin of that grid around the bodies [fraction of their longest side]
-MARGIN = 1.0
 # longest displacement for the trapezoidal rule [fraction of the depth]; over a longer
 # displacement a difference of depths has more digits
 SHORT = 1e-4
@@ -98,10 +96,10 @@ class FunctionSolid(DistanceSolid):
         return distance, gradient
 
     def surface(self, low: Positions, high: Positions) -> Surface:
-        """Return the surface by marching cubes; it is open where the grid ends."""
+        """Return the surface by marching cubes, up to the bodies' longest side away from them."""
         import igl
 
-        margin = MARGIN * (high - low).max()
+        margin = (high - low).max()
         axes = [
             np.linspace(*ends, POINTS) for ends in zip(low - margin, high + margin, strict=True)
         ]

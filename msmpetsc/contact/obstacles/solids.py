@@ -16,8 +16,6 @@ from msmpetsc.backend.kernel import kernel, njit
 
 # smallest length to divide by [m]
 TINY = 1e-300
-# largest cosine between the normals of opposite faces [-]; -1 up to rounding
-OPPOSITE = -1 + 1e-9
 # rounding of a crossing [fraction of a path]; so that a plate of zero thickness stops
 # nodes
 ROUNDED = 1e-12
@@ -122,7 +120,8 @@ def _stays(q: Positions, i: int, planes: Planes, face: int) -> bool:
         along = 0.0
         for c in range(3):
             along += planes.normals[f, c] * planes.normals[face, c]
-        if along > OPPOSITE and behind(q, i, planes, f) <= 0.0:
+        # the normals of a box are exact
+        if along > -1.0 and behind(q, i, planes, f) <= 0.0:
             return False
     return True
 

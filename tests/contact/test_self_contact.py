@@ -10,7 +10,7 @@ import igl
 import numpy as np
 import pytest
 import trimesh
-from block_scene import GRAVITY, G, block_scene, model_of, play, solid_of, write_scene
+from block_scene import GRAVITY, block_scene, model_of, play, solid_of, write_scene
 from crossings import count_crossings, crossings
 from mpi4py import MPI
 from pinch import ARM, HALF, RADIUS, pinch_scene, u_tube
@@ -305,43 +305,6 @@ def test_presets_of_a_are_refused(tmp_path):
     scene = load_scene(pinch_scene(tmp_path), ("solver.preset=anderson",))
     with pytest.raises(InputError, match="one of newton's presets, not anderson"):
         refuse_bad_options(scene)
-
-
-@pytest.mark.slow
-def test_a_block_holds_on_a_tilted_one(tmp_path: Path):
-    """A block on a tilted plate creeps only once in 20 steps, when the slip is reset.
-
-    The block falls onto a plate in the same mesh. Gravity is tilted by 20 degrees.
-    """
-    cell, tilt = 1 / 16, np.radians(20.0)
-    plate = trimesh.creation.box(bounds=[[0, 0, 0], [1.5, 0.375, cell]])
-    block = trimesh.creation.box(bounds=[[0.125, 0.09375, 3 * cell], [0.375, 0.28125, 6 * cell]])
-    path = block_scene(
-        tmp_path,
-        cages={"cell_size": cell},
-        material=solid_of(1e6),
-        time={"step": 0.01, "duration": 0.7},
-        gravity={"acceleration": [G * np.sin(tilt), 0.0, -G * np.cos(tilt)]},
-        pin=[{"region": {"box": [[-1, -1, -1], [2, 1, 1.5 * cell]]}}],
-        solver={"preset": "newton", "error": 1e-4},
-        self_contact={"distance": 0.003, "friction": 0.5},
-    )
-    fine = [plate.subdivide().subdivide().subdivide(), block.subdivide().subdivide()]
-    trimesh.util.concatenate(fine).export(tmp_path / "scene.ply")
-    model, frames = play(path)
-    mass = model.lattice.mass * (model.lattice.nodes[:, 2] > 2 * cell)
-    along = np.array([mass @ frame.position[:, 0] for frame in frames]) / mass.sum()
-    # speed [m/s] of the block down the plate in each step from the 51st on, at rest on
-    # the plate
-    speed = np.diff(along)[50:] / 0.01
-    # stick speed [m/s], by the longest side of the mesh
-    stick = 1e-2 * 1.5
-    creep = stick * (1 - np.sqrt(1 - np.tan(tilt) / 0.5))
-    # the slip is reset once in steps 51 to 70
-    assert speed.mean() == pytest.approx(creep / 20, rel=0.3)
-    assert abs(speed[:9].mean()) < 0.01 * creep
-    # a step starts from the end of the last step, not from free flight
-    assert max(frame.iterations for frame in frames[51:]) <= 8
 
 
 def test_a_pair_of_edges_is_the_same_whichever_is_found_first():

@@ -14,7 +14,7 @@ from msmpetsc.constraints.forces import ActingForces
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.obstacles.node_obstacles import NodeObstacles
 from msmpetsc.contact.step_contact import StepContact
-from msmpetsc.contact.surface.pairs import CandidateCache, ContactSearch, ContactSummary
+from msmpetsc.contact.surface.pairs import ContactSearch, ContactSummary
 from msmpetsc.contact.surface.surface_contact import SurfaceContact
 from msmpetsc.elasticity.energy import Elasticity
 
@@ -32,7 +32,7 @@ class Environment:
 
     damping     : mass-proportional damping rate [1/s]
     retardation : viscosity over stiffness [s]
-    contacts    : surface contacts of the step begun last; None without surface contact
+    contacts    : surface contacts; None without surface contact
     touches     : whether the model has penalty obstacles or surface contact
     system_monitor : function called with the first iterate of each solve and its Jacobian, or None
     """
@@ -45,16 +45,15 @@ class Environment:
         self.anchors = Anchors(model.lattice, model.anchors)
         self.obstacles = NodeObstacles(model.lattice, model.penalties, model.exchanges)
         self.moving: list[Anchor | Obstacle] = [*model.anchors, *model.obstacles]
-        self.self_contact = (
-            CandidateCache(self.lattice.table.comm, model.collision) if model.collision else None
+        self.contacts = (
+            ContactSearch(self.lattice.table.comm, model.collision) if model.collision else None
         )
-        self.contacts = ContactSearch(self.self_contact, 0.0, 0.0) if self.self_contact else None
         self.has_friction = self.obstacles.has_friction or bool(
-            self.self_contact and self.self_contact.law.friction > 0
+            self.contacts and self.contacts.law.friction > 0
         )
         # end positions and contact of the last step; None without contact or friction
         self._ended: tuple[Positions, StepContact] | None = None
-        self.touches = bool(model.penalties or self.self_contact)
+        self.touches = bool(model.penalties or self.contacts)
         self.system_monitor: Callable[[Any, Any], None] | None = None
 
     @cached_property
@@ -107,9 +106,9 @@ class Environment:
 
         If contacts are few, only pairs near them are candidates (collective).
         """
-        if self.self_contact:
+        if self.contacts:
             begin = max(time - time_step, 0.0)
-            self.contacts = ContactSearch(self.self_contact, begin, time, self.contacts)
+            self.contacts.begin_step(begin, time)
             self.contacts.narrow(q, begin)
 
     def _previous_contact(self, q: Positions) -> StepContact | None:
@@ -136,9 +135,8 @@ class Environment:
     def forget(self) -> None:
         """Clear the contact history, so that the next step depends on q alone (collective)."""
         self._ended = None
-        if self.self_contact:
-            self.self_contact.forget()
-            self.contacts = ContactSearch(self.self_contact, 0.0, 0.0)
+        if self.contacts:
+            self.contacts.forget()
 
     def touch(self, q: Positions, time: float) -> ContactSummary:
         """Return number, least distance and energy of surface contacts at q (collective).

@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 import msmpetsc.contact.surface.pairs
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw
-from msmpetsc.contact.surface.pairs import CandidateCache, ContactSearch
+from msmpetsc.contact.surface.pairs import ContactSearch
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.surface import Surface
@@ -147,7 +147,7 @@ def test_a_way_is_cut_where_pairs_are_known_at_its_end_alone(folder: Path):
     assert model.collision is not None
     start = model.lattice.nodes.copy()
     end = start - np.where(model.lattice.body[:, None] == 1, [0, 0, 0.02 + 2.5 * SIDE], 0.0)
-    contacts = ContactSearch(CandidateCache(MPI.COMM_SELF, model.collision), 0.0, 0.01)
+    contacts = ContactSearch(MPI.COMM_SELF, model.collision)
     contacts.find(start)
     contacts.find(end)
     free = 0.02 / (0.02 + 2.5 * SIDE)
@@ -216,8 +216,8 @@ def test_the_surface_is_asked_about_around_what_touches_alone(
 
 
 def begun_with_all(self: Environment, q: np.ndarray, time: float, time_step: float) -> None:
-    assert self.self_contact is not None
-    self.contacts = ContactSearch(self.self_contact, max(time - time_step, 0.0), time)
+    assert self.contacts is not None
+    self.contacts.begin_step(max(time - time_step, 0.0), time)
 
 
 def test_what_stores_too_little_to_count_may_be_left_out(folder: Path, monkeypatch):
@@ -226,7 +226,7 @@ def test_what_stores_too_little_to_count_may_be_left_out(folder: Path, monkeypat
     model = model_of(scene)
     assert model.collision is not None
     contacts, start = (
-        ContactSearch(CandidateCache(MPI.COMM_SELF, model.collision), 0.0, 0.01),
+        ContactSearch(MPI.COMM_SELF, model.collision),
         model.lattice.nodes,
     )
     end = start - np.where(model.lattice.body[:, None] == 1, [0, 0, 0.002 - 0.5 * DISTANCE], 0.0)

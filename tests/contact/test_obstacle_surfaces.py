@@ -26,7 +26,7 @@ from test_contact import PRESSED, off_the_slide
 from msmpetsc.build import Model
 from msmpetsc.contact.step_contact import StepContactAt
 from msmpetsc.contact.surface.obstacle_surfaces import ObstacleSurfaces
-from msmpetsc.contact.surface.pairs import CandidateCache, ContactSearch
+from msmpetsc.contact.surface.pairs import ContactSearch
 from msmpetsc.contact.surface.surface_contact import SurfaceContact
 from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
@@ -204,7 +204,8 @@ def test_a_block_that_turns_with_a_table_slips_by_nothing_in_a_step_of_bdf2(tmp_
     def turned(time: float) -> np.ndarray:
         return Rotation.from_rotvec([0, 0, 2 * np.pi * time]).apply(model.lattice.nodes)
 
-    contacts = ContactSearch(CandidateCache(MPI.COMM_SELF, model.collision), t, 2 * t)
+    contacts = ContactSearch(MPI.COMM_SELF, model.collision)
+    contacts.begin_step(t, 2 * t)
     contact = SurfaceContact(contacts, turned(t), t, turned(0))
     friction = contact.friction
     assert friction is not None and len(friction.pairs) > 10

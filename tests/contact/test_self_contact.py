@@ -17,7 +17,7 @@ from pinch import ARM, HALF, RADIUS, pinch_scene, u_tube
 from stopped_runs import assert_goes_on_exactly
 
 from msmpetsc.build import Model
-from msmpetsc.contact.surface.pairs import CandidateCache, ContactSearch
+from msmpetsc.contact.surface.pairs import ContactSearch
 from msmpetsc.contact.surface.surface_contact import SMALL, SurfaceContact
 from msmpetsc.contact.surface.surface_friction import FrictionPairs, friction_pairs
 from msmpetsc.errors import InputError
@@ -50,7 +50,7 @@ def contact(model: Model, slid: float = 0.0) -> tuple[SurfaceContact, np.ndarray
     assert model.collision is not None
     end = q.copy()
     end[q[:, 0] < 0, 1] += slid
-    return SurfaceContact(ContactSearch(CandidateCache(COMM, model.collision), 0.0, T), q, T), end
+    return SurfaceContact(ContactSearch(COMM, model.collision), q, T), end
 
 
 # without friction, below the kink of friction, and beyond it
@@ -120,7 +120,7 @@ def test_friction_of_a_step_of_bdf2_goes_by_the_push_and_the_velocity_that_it_en
     q = closed(model)
     # the left arm moves towards the right arm and along it
     came = np.where(q[:, :1] < 0, [2e-5, 1e-4, 0.0], 0.0)
-    contacts = ContactSearch(CandidateCache(COMM, model.collision), 0.0, T)
+    contacts = ContactSearch(COMM, model.collision)
     now, before = (SurfaceContact(contacts, at, T).friction for at in (q, q - came))
     friction = SurfaceContact(contacts, q, T, q - came).friction
     expected = np.clip(2 * now.limit - now.values_of(before.pairs, before.limit), 0, 2 * now.limit)
@@ -135,7 +135,7 @@ def test_friction_of_a_step_of_bdf2_goes_by_the_push_and_the_velocity_that_it_en
 
 def test_friction_goes_on_from_the_slip_that_pairs_held(model):
     q = closed(model)
-    contacts = ContactSearch(CandidateCache(COMM, model.collision), 0.0, T)
+    contacts = ContactSearch(COMM, model.collision)
     first = SurfaceContact(contacts, q, T)
     stick, end = first.friction.stick, q.copy()
     end[q[:, 0] < 0, 1] += 0.4 * stick

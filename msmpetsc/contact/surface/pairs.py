@@ -3,9 +3,8 @@
 The broad phase finds candidate pairs at given positions. The pairs are valid until a point has
 moved by more than a margin; a translation of all points does not count.
 
-Candidate pairs outlive a step (``CandidateCache``). Contacts at positions are kept during a step
-(``ContactSearch``). If few points touch, a step is narrow: it uses the candidates around these
-points, and all candidates once, at its end.
+If few points touch, a step is narrow: it uses the candidates around these points, and all
+candidates once, at its end.
 """
 
 from dataclasses import dataclass
@@ -113,27 +112,51 @@ class SurfaceContactsAt:
     contacts: ContactSets
 
 
-class CandidateCache:
-    """Cache of a run's candidate pairs.
+class ContactSearch:
+    """Contacts of the surface in a step from ``begin`` to ``time`` [s].
 
-    All methods are collective. Positions are (owned or more, 3) [m].
+    All methods are collective. Positions are (owned or more, 3) [m]. Obstacles have their places at
+    the end of the step unless another time is given. Candidate pairs, contacts and points of the
+    last positions outlive a step.
 
-    barrier : on rank 0
-    edge    : mean length of the surface's edges at rest [m]
+    barrier     : on rank 0
+    edge        : mean length of the bodies' edges at rest [m]
+    is_narrow   : whether only candidates around known contacts are used
+    is_left_out : whether the step is narrow without contacts, so that the surface is left out
     """
 
     def __init__(self, comm: MPI.Comm, collision: CollisionSurface):
         self.comm, self.points, self.law = comm, collision.points, collision.law
-        self.name_of = collision.name_of
+        self.name_of, self.obstacles = collision.name_of, collision.points.obstacles
         self.owned, surface = collision.points.weights.shape[1], collision.surface
         self.barrier: Barrier | None = on_root(
             comm, lambda: _barrier(surface, collision) if surface else None
         )
         self.edge: float = comm.bcast(self.barrier.edge if self.barrier else 0.0)
+        self.begin = self.time = 0.0
+        self.is_narrow = self.is_left_out = False
+        # Candidates of a narrow step, and whether they are around each point (p,), on
+        # rank 0
+        self._around: CandidateSets = ()
+        self._touched: Mask | None = None
         # The newest first
         self._known: list[CandidatePairs] = []
+        self._moments: list[SurfaceContactsAt] = []
+        # q, time and points of the last positions
+        self._points: list[tuple[Positions, float, Positions]] = []
 
-    def valid_at(self, *places: Positions) -> CandidatePairs | None:
+    def begin_step(self, begin: float, time: float) -> None:
+        """Use all candidates in a step between two times [s]."""
+        self.begin, self.time, self._touched = begin, time, None
+        if self.is_narrow:
+            self.widen()
+
+    def forget(self) -> None:
+        """Forget all positions, so that the next step does not depend on earlier steps."""
+        self.begin_step(0.0, 0.0)
+        self._known, self._moments, self._points = [], [], []
+
+    def _valid_at(self, *places: Positions) -> CandidatePairs | None:
         """Return the newest candidates that are valid at all ``places``, or None.
 
         places : points (p, 3) [m]
@@ -147,46 +170,13 @@ class CandidateCache:
         self._known.insert(0, self._known.pop(number))
         return self._known[0]
 
-    def broad_phase(self, points: Positions, moved: Rows | None = None) -> CandidatePairs:
+    def _broad_phase(self, points: Positions, moved: Rows | None = None) -> CandidatePairs:
         """Find and cache candidate pairs at points (p, 3) [m], or on their paths by ``moved``."""
         margin = REACH * self.edge
         sets = self.barrier.candidates(points, margin, moved) if self.barrier else ()
         newest = CandidatePairs(margin, points, sets, moved)
         self._known = [newest, *self._known[: REMEMBERED - 1]]
         return newest
-
-    def forget(self) -> None:
-        """Forget all candidates, so that the next step does not depend on earlier steps."""
-        self._known = []
-
-
-class ContactSearch:
-    """Contacts in a step from ``begin`` to ``time`` [s]. All methods are collective.
-
-    Positions are (owned or more, 3) [m]. Obstacles have their places at the end of the step unless
-    another time is given.
-
-    before      : contacts of the last step, which ended where this step begins
-    is_narrow   : whether only candidates around known contacts are used
-    is_left_out : whether the step is narrow without contacts, so that the surface is left out
-    """
-
-    def __init__(
-        self, near: CandidateCache, begin: float, time: float, before: "ContactSearch | None" = None
-    ):
-        self.begin, self.time = begin, time
-        self.near, self.comm, self.points, self.law = near, near.comm, near.points, near.law
-        self.barrier, self.owned, self.obstacles = near.barrier, near.owned, near.points.obstacles
-        self.is_narrow = self.is_left_out = False
-        # Candidates of a narrow step, and whether they are around each point (p,), on
-        # rank 0
-        self._around: CandidateSets = ()
-        self._touched: Mask | None = None
-        self._moments: list[SurfaceContactsAt] = (
-            before._moments if before and not before.is_narrow else []
-        )
-        # q, time and points of the last positions
-        self._points: list[tuple[Positions, float, Positions]] = before._points if before else []
 
     def find(self, q: Positions, time: float | None = None) -> SurfaceContactsAt:
         """Return the contacts at positions q.
@@ -199,7 +189,7 @@ class ContactSearch:
                 return moment
         points, sets = self.points_at(q, time), self._around
         if not self.is_narrow:
-            sets = (self.near.valid_at(points) or self.near.broad_phase(points)).sets
+            sets = (self._valid_at(points) or self._broad_phase(points)).sets
         contacts = self.barrier.contacts(sets, points) if self.barrier else ()
         count = self.comm.bcast(sum(map(len, contacts)))
         self._moments = [
@@ -225,7 +215,7 @@ class ContactSearch:
         )
         points = self.points_at(q, self.time) if self.is_narrow and not self.is_left_out else None
         if self.barrier and points is not None and touched is not None:
-            self._around = self.barrier.around(touched, points, FARTHEST * self.near.edge)
+            self._around = self.barrier.around(touched, points, FARTHEST * self.edge)
         return self.is_narrow
 
     def widen(self) -> None:
@@ -284,7 +274,7 @@ class ContactSearch:
         moment, words = self.find(q), ""
         if self.barrier:
             points = self.barrier.nearest(moment.contacts, moment.points)
-            names = dict.fromkeys(self.near.name_of(point) for point in points)
+            names = dict.fromkeys(self.name_of(point) for point in points)
             place = ", ".join(f"{x:.4g}" for x in moment.points[points].mean(axis=0))
             words = (
                 f"{' and '.join(names)} meet at ({place}) m"
@@ -306,13 +296,13 @@ class ContactSearch:
         moved, sets = self.points_at(end, self.time) - start, self._around
         if not self.is_narrow:
             # Candidates must be valid at both ends of the path
-            known = self.near.valid_at(start, start + moved)
+            known = self._valid_at(start, start + moved)
             length = self.comm.bcast(farthest(moved) if self.barrier else 0.0)
-            if not known and length > PIECE * self.near.edge:
+            if not known and length > PIECE * self.edge:
                 return float(
                     self.comm.bcast(sweep(self.barrier, start, moved) if self.barrier else 1.0)
                 )
-            sets = (known or self.near.broad_phase(start, moved)).sets
+            sets = (known or self._broad_phase(start, moved)).sets
         return float(
             self.comm.bcast(
                 collision_free_step(self.barrier, start, moved, sets) if self.barrier else 1.0

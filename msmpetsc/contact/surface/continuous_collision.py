@@ -2,8 +2,7 @@
 
 The broad phase finds the pairs that may meet on the paths. The narrow phase is ipctk's additive CCD
 (Li, Kaufman and Jiang 2021, Codimensional Incremental Potential Contact). A translation that all
-points share is ignored. ``collision_free_step`` takes paths whose candidates are known. ``sweep``
-takes paths of any length, piece by piece.
+points share is ignored. Long paths are taken piece by piece.
 """
 
 from typing import TYPE_CHECKING
@@ -63,34 +62,25 @@ def _without_linear_part(points: Positions, moved: Rows) -> tuple[Rows, float]:
 
 
 def collision_free_step(
-    barrier: "Barrier", start: Positions, moved: Rows, sets: "CandidateSets"
+    barrier: "Barrier", start: Positions, moved: Rows, sets: "CandidateSets | None" = None
 ) -> float:
     """Return the collision-free step length, at most 1, from start (p, 3) by ``moved`` (p, 3) [m].
 
-    sets : candidate pairs of the paths
-    """
-    share = _share_to_crossing(barrier, start, start + moved - moved.mean(axis=0), sets)
-    return share if share >= 1 else TAKEN * share
-
-
-def sweep(barrier: "Barrier", start: Positions, moved: Rows) -> float:
-    """Return the collision-free step length, at most 1, of paths of any length.
-
-    Each piece of the paths has its own candidates. A step length covers PIECES pieces at most.
-
-    start, moved : positions and displacements (p, 3) [m]
+    sets : candidate pairs of the paths; None to find the candidates of each piece of the paths. A
+           step length then covers PIECES pieces at most.
     """
     moved = moved - moved.mean(axis=0)
-    whole = max(
-        int(np.ceil(float(np.sqrt((moved**2).sum(axis=1).max())) / (PIECE * barrier.edge))), 1
-    )
+    whole = 1
+    if sets is None:
+        length = float(np.linalg.norm(moved, axis=1).max())
+        whole = max(int(np.ceil(length / (PIECE * barrier.edge))), 1)
     for piece in range(min(whole, PIECES)):
         begin, end = (start + i / whole * moved for i in (piece, piece + 1))
-        sets = barrier.candidates(begin, 0.0, end - begin)
-        share = _share_to_crossing(barrier, begin, end, sets)
+        near = barrier.candidates(begin, 0.0, end - begin) if sets is None else sets
+        share = _share_to_crossing(barrier, begin, end, near)
         if share < 1:
             return TAKEN * (piece + share) / whole
-    return 1.0 if whole <= PIECES else PIECES / whole
+    return min(PIECES / whole, 1.0)
 
 
 def _share_to_crossing(

@@ -15,7 +15,7 @@ from mpi4py import MPI
 from msmpetsc.backend.arrays import Mask, Positions, Rows
 from msmpetsc.comm import log, on_root, reduced
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw, CandidateSets, ContactSets
-from msmpetsc.contact.surface.continuous_collision import PIECE, collision_free_step, sweep
+from msmpetsc.contact.surface.continuous_collision import PIECE, collision_free_step
 from msmpetsc.contact.surface.creases import NEAREST
 from msmpetsc.contact.surface.points import SurfacePoints
 from msmpetsc.geometry.surface import Surface
@@ -293,21 +293,17 @@ class ContactSearch:
         """
         begin = self.time if begin is None else begin
         start = self.points_at(q, begin)
-        moved, sets = self.points_at(end, self.time) - start, self._around
+        moved = self.points_at(end, self.time) - start
+        sets: CandidateSets | None = self._around
         if not self.is_narrow:
             # Candidates must be valid at both ends of the path
             known = self._valid_at(start, start + moved)
             length = self.comm.bcast(farthest(moved) if self.barrier else 0.0)
-            if not known and length > PIECE * self.edge:
-                return float(
-                    self.comm.bcast(sweep(self.barrier, start, moved) if self.barrier else 1.0)
-                )
-            sets = (known or self._broad_phase(start, moved)).sets
-        return float(
-            self.comm.bcast(
-                collision_free_step(self.barrier, start, moved, sets) if self.barrier else 1.0
-            )
-        )
+            if not known and length <= PIECE * self.edge:
+                known = self._broad_phase(start, moved)
+            sets = known.sets if known else None
+        share = collision_free_step(self.barrier, start, moved, sets) if self.barrier else 1.0
+        return float(self.comm.bcast(share))
 
 
 def farthest(moved: Rows) -> float:

@@ -56,20 +56,27 @@ def force(region: dict, **more) -> dict:
     return {"region": region, "total": [0, 0, -1.0]} | more
 
 
+HALF_PIN = {"pin": [{"region": LEFT_HALF}]}
+LED = {"region": LEFT, "path": UP}
+HALF_LED = LED | {"region": LEFT_HALF}
+
+
 @pytest.mark.parametrize(
-    "tables",
+    ("tables", "message"),
     [
-        {"pin": [{"region": LEFT_HALF}], "force": [force(LEFT)]},
-        {"anchor": [{"region": LEFT_HALF, "path": UP}], "force": [force(LEFT)]},
-        {
-            "anchor": [{"region": LEFT_HALF, "path": UP, "stop": 0.05}],
-            "force": [force(LEFT, stop=0.05)],
-        },
+        (HALF_PIN | {"force": [force(LEFT)]}, "moves nothing"),
+        ({"anchor": [HALF_LED], "force": [force(LEFT)]}, "moves nothing"),
+        # the anchor holds the nodes as long as the force acts
+        (
+            {"anchor": [HALF_LED | {"stop": 0.05}], "force": [force(LEFT, stop=0.05)]},
+            "moves nothing",
+        ),
+        ({"anchor": [LED, LED | {"path": ASIDE}]}, r"anchor\.1: .* it leads none"),
+        (HALF_PIN | {"anchor": [LED]}, r"anchor\.0: .* it leads none"),
     ],
-    ids=["pinned", "led", "led for as long as it acts"],
 )
-def test_a_force_on_no_free_node_is_refused(tmp_path, tables):
-    with pytest.raises(InputError, match="moves nothing"):
+def test_a_table_on_held_nodes_alone_is_refused(tmp_path, tables, message):
+    with pytest.raises(InputError, match=message):
         build(tmp_path, **tables)
 
 
@@ -89,16 +96,6 @@ def test_a_force_that_finds_a_free_node_is_not(tmp_path, heard, tables, held):
         and (f"({held} of them held)" in words) == bool(held)
         and heard() == []
     )
-
-
-def test_of_two_anchors_on_the_same_nodes_the_second_is_refused(tmp_path):
-    twice = [{"region": LEFT, "path": UP}, {"region": LEFT, "path": ASIDE}]
-    for number, more in (
-        (1, {"anchor": twice}),
-        (0, {"anchor": twice[:1], "pin": [{"region": LEFT_HALF}]}),
-    ):
-        with pytest.raises(InputError, match=rf"anchor.{number}: .* it leads none"):
-            build(tmp_path, **more)
 
 
 def test_nodes_that_two_anchors_want_are_warned_of(tmp_path, heard):

@@ -48,10 +48,7 @@ class Environment:
         self.contacts = (
             ContactSearch(self.lattice.table.comm, model.collision) if model.collision else None
         )
-        self.has_friction = self.obstacles.has_friction or bool(
-            self.contacts and self.contacts.law.friction > 0
-        )
-        # end positions and contact of the last step; None without contact or friction
+        # end positions and contact of the last step; None without contact
         self._ended: tuple[Positions, StepContact] | None = None
         self.touches = bool(model.penalties or self.contacts)
         self.system_monitor: Callable[[Any, Any], None] | None = None
@@ -120,14 +117,14 @@ class Environment:
 
     def end_step(self, x: Positions, contact: StepContact | None) -> None:
         """Record that a step ended at x (l, 3) [m], from which friction continues."""
-        self._ended = (x, contact) if contact and self.has_friction else None
+        self._ended = (x, contact) if contact else None
 
     def friction_lags(self, x: Positions, contact: StepContact | None) -> bool:
         """Return whether friction in a step to x (l, 3) [m] used an outdated limit (collective).
 
         The limit is outdated if it differs from mu N at x by more than a factor of LAG_LIMIT.
         """
-        if not (contact and self.has_friction):
+        if not contact:
             return False
         used, at_end = reduced(self.lattice.table.comm, contact.friction_limits(x))
         return bool(max(at_end, used) > LAG_LIMIT * min(at_end, used))

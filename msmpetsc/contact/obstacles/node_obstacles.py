@@ -36,7 +36,6 @@ class NodeObstacles:
         self.pressing = slice(len(penalties))
         self.exchanging = slice(len(penalties), None)
         self.strikes = bool(exchanges) or any(p.restitution is not None for p in penalties)
-        self.has_friction = any(p.friction > 0 for p in penalties)
         nodes = lattice.nodes
         self.no_sides: Indices = np.zeros((len(self.all), len(nodes)), np.int8, like=nodes)
 

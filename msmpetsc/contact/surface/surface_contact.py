@@ -163,20 +163,17 @@ class SurfaceContact:
 
     def friction_limits(self, q: Positions) -> Floats:
         """Return the sums of mu N [N], (2,), as friction uses it and at q; 0 on ranks above 0."""
+        if self.contacts.law.friction == 0:
+            return np.zeros(2)
         moment, barrier = self.contacts.find(q), self.contacts.barrier
-        if self.contacts.law.friction == 0 or not barrier:
+        if not barrier:
             return np.zeros(2)
         by = self.friction.limit.sum() if self.friction else 0.0
         return np.array([by, barrier.friction_limits(moment.contacts, moment.points)[1].sum()])
 
-    def _acting(self, q: Positions) -> SurfaceContactsAt | None:
-        """Return the contacts at q, with points for friction; None if nothing acts."""
-        moment = self.contacts.find(q)
-        return moment if moment.count or self.has_friction else None
-
     def presses(self, q: Positions) -> bool:
         """Return whether contact acts at q."""
-        return self._acting(q) is not None
+        return self.contacts.find(q).count > 0 or self.has_friction
 
     def change(self, q: Positions, base: Positions) -> float:
         """Return this rank's part of the energy at q minus that at base, with friction [J].
@@ -184,17 +181,14 @@ class SurfaceContact:
         Over a small displacement the change is the displacement times the mean force, since a
         difference of energies would lose its digits.
         """
-        before, after = self._acting(base), self._acting(q)
-        if after is None and before is None:
-            return 0.0
+        before, after = self.contacts.find(base), self.contacts.find(q)
         is_small, of_friction = self._is_small(q, base), 0.0
         moved = self.contacts.points.moved(q - base) if is_small else None
-        if self.friction and after and before:
+        if self.friction:
             of_friction = self.friction.change(after.points, before.points, moved)
         if moved is not None:
-            return of_friction + sum(
-                0.5 * float(np.vdot(self._pushes(m), moved)) for m in (before, after) if m
-            )
+            mean = 0.5 * (self._pushes(before) + self._pushes(after))
+            return of_friction + float(np.vdot(mean, moved))
         return of_friction + self._energy(after) - self._energy(before)
 
     def _is_small(self, q: Positions, base: Positions) -> bool:
@@ -203,16 +197,14 @@ class SurfaceContact:
         gone = np.abs(points(q, time) - points(base, time)).max(initial=0.0)
         return bool(self.comm.bcast(gone < SMALL * self.contacts.law.distance))
 
-    def _energy(self, moment: SurfaceContactsAt | None) -> float:
+    def _energy(self, moment: SurfaceContactsAt) -> float:
         """Return the energy [J] of the barrier on rank 0, else 0."""
         barrier = self.contacts.barrier
-        return barrier.energy(moment.contacts, moment.points) if barrier and moment else 0.0
+        return barrier.energy(moment.contacts, moment.points) if barrier else 0.0
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add the gradient [N] at q to ``gradient`` (owned or more, 3)."""
-        moment = self._acting(q)
-        if moment is not None:
-            self._add_to_nodes(self._gradient(moment), gradient)
+        self._add_to_nodes(self._gradient(self.contacts.find(q)), gradient)
 
     def _add_to_nodes(self, forces: Rows, gradient: Rows) -> None:
         """Add W^T f of forces (total, 3) [N] on rank 0 to ``gradient`` (owned or more, 3)."""
@@ -229,9 +221,7 @@ class SurfaceContact:
 
         displacements : (o, 3) of the obstacles' points [m]
         """
-        moment = self._acting(q)
-        if moment is None:
-            return
+        moment = self.contacts.find(q)
         moved = np.zeros_like(moment.points)
         if len(moved):
             moved[self.contacts.points.bodies :] = displacements
@@ -263,11 +253,11 @@ class SurfaceContact:
 
         frame : (3,) displacement of the frame [m] in which the work is counted
         """
-        moment = self._acting(q)
+        moment = self.contacts.find(q)
         points, obstacles = self.contacts.points, self.contacts.obstacles
         step = self.contacts.begin, self.contacts.time
         forces_and_work = np.zeros((len(obstacles.numbers), 3)), 0.0
-        if obstacles.total and moment is not None:
+        if obstacles.total:
             if len(moment.points):
                 forces = self._gradient(moment)[points.bodies :]
                 moved = obstacles.displacements(*step)
@@ -297,18 +287,16 @@ class SurfaceContact:
 
     def released(self, q: Positions) -> float:
         """Return the energy [J] of elastic slips at the start minus that at q, on rank 0."""
-        moment = self._acting(q)
-        if self.friction is None or moment is None:
-            return 0.0
-        return self.friction.released(moment.points)
+        moment = self.contacts.find(q)
+        return self.friction.released(moment.points) if self.friction else 0.0
 
     def duals_after(self, q: Positions, base: Positions, duals: Rows | None) -> Rows | None:
         """Return friction's duals (a, 3) after the full step from base to q.
 
         duals : (a, 3) at base; None for the forces of the slips
         """
-        after, before = self._acting(q), self._acting(base)
-        if self.friction and after and before:
+        after, before = self.contacts.find(q), self.contacts.find(base)
+        if self.friction:
             duals = self.friction.duals_after(after.points, before.points, duals)
         of_root: Rows | None = self.comm.bcast(duals)
         return of_root
@@ -321,10 +309,9 @@ class SurfaceContact:
         projected : project the Hessian of each pair to be positive semidefinite
         duals     : (a, 3) duals of friction; None for the true Hessian of friction
         """
-        moment = self._acting(q)
-        if moment is None:
+        moment, known = self.contacts.find(q), self._hessians.get(projected)
+        if not (moment.count or self.has_friction):
             return None
-        known = self._hessians.get(projected)
         if known is None or known[0] is not moment or known[1] is not duals:
             touched, points = self.comm.bcast(self._curvature(moment, projected, duals))
             known = (
@@ -341,10 +328,7 @@ class SurfaceContact:
         The diagonal of row sums r bounds the negative part on points. The bound on nodes follows
         from (sum w v)^2 <= (sum |w|) (sum |w| v^2).
         """
-        moment = self._acting(q)
-        if moment is None:
-            return np.zeros(self.contacts.owned)
-        touched, sums = self.comm.bcast(self._negative_part(moment))
+        touched, sums = self.comm.bcast(self._negative_part(self.contacts.find(q)))
         bound: Floats = self.contacts.points.spread * (
             np.abs(self.contacts.points.carried(touched)).T @ sums
         )

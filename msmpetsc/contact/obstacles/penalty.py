@@ -5,10 +5,6 @@ A node at depth d > 0 has the energy 1/2 k d^2, which is convex for a single fac
 
 A step of BDF2 uses N_(n+1) = 2 N_n - N_(n-1) as the normal force of friction, and the slip
 u = tau v_(n+1) (solve.integrators.implicit).
-
-The ``side`` of a node is the face by which the node entered a box. Depth is measured from this
-face, even beyond the opposite face, so a node that passes a plate in a step is pushed back. Without
-a side, depth is measured from the nearest face.
 """
 
 from collections.abc import Sequence
@@ -105,7 +101,8 @@ class Penalty:
 class ObstacleContact:
     """Penalty contact with an obstacle at the time [s] at which a step ends.
 
-    sides    : (owned or more,) sides of the nodes (solids.side_of); None for the nearest face
+    sides    : (owned or more,) sides of the nodes (solids.side_of), from whose faces depths are
+               measured, even beyond the opposite face; None for the nearest face
     friction : friction in the step; None without friction
     """
 

@@ -4,10 +4,9 @@ Two parts of triangles closer than dhat have the energy kappa a b(d) (Li et al. 
 Potential Contact). Here a is an area of the surface and d the distance of the parts.
 b = -2 ((d/dhat)^2 - 1)^2 ln(d/dhat) is smooth at dhat and unbounded at d = 0.
 
-If several pairs share a place of contact, the place counts once (contact.surface.places). So the
-energy is continuous, and as large over a vertex as beside it. If all pairs counted, aligned meshes
-would push each other aside. If the nearest pairs alone counted (Chen et al. 2025, Offset Geometric
-Contact), the energy would jump as the nearest part changes, and line searches would fail.
+If several pairs share a place of contact, the place counts once (contact.surface.places). If all
+pairs counted, aligned meshes would push each other aside. If the nearest pairs alone counted (Chen
+et al. 2025, Offset Geometric Contact), line searches would fail as the nearest part changes.
 
 Pairs in creases push from smaller distances (contact.surface.creases). Candidates and contacts are
 therefore tuples with a set for each distance.

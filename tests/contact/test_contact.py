@@ -544,7 +544,7 @@ def test_a_particle_struck_by_a_moving_plane_leaves_with_twice_its_speed_and_its
     q, before = np.array([[0.3, 0, 0.2], [0.3, 0, 0.4]]), np.array([[0.2, 0, 0.23], [0.3, 0, 0.4]])
     for e in (1.0, 0.5, 0.0):
         # the plane has moved to 0.25
-        after, after_before = Exchange(floor, e).exchanged(q, before, StepTaken(0.5, T))
+        after, after_before = Exchange(floor, e).struck(q, before, StepTaken(0.5, T))
         v, v_plane = -0.3, 0.5
         np.testing.assert_allclose(
             (after - after_before)[0] / T, [1.0, 0, v_plane + e * (v_plane - v)]
@@ -553,7 +553,7 @@ def test_a_particle_struck_by_a_moving_plane_leaves_with_twice_its_speed_and_its
     # 0.9 m/s upwards: faster than the plane, so the plane does not push the node
     leaving = q + np.array([0, 0, 0.06])
     np.testing.assert_array_equal(
-        Exchange(floor, 1.0).exchanged(leaving[:1], before[:1], StepTaken(0.5, T))[0], leaving[:1]
+        Exchange(floor, 1.0).struck(leaving[:1], before[:1], StepTaken(0.5, T))[0], leaving[:1]
     )
 
 
@@ -562,7 +562,7 @@ def test_a_particle_bounces_off_the_side_of_a_box_that_it_went_into():
     q = np.array([[0.1, 0.5, 0.4], [0.5, 0.95, 0.5], [0.5, 0.5, -0.1]])
     before = q + np.array([[-0.2, 0.05, 0], [0, 0.1, 0.1], [0, 0, -0.1]])
     step = StepTaken(1.0, T, cube.sides(before, q, 1.0, T))
-    after, after_before = Exchange(cube, 1.0).exchanged(q, before, step)
+    after, after_before = Exchange(cube, 1.0).struck(q, before, step)
     v = q - before
     np.testing.assert_allclose(
         after - after_before, v * [[-1, 1, 1], [1, -1, 1], [1, 1, 1]], atol=1e-15
@@ -573,7 +573,7 @@ def test_an_obstacle_acts_from_start_to_before_stop():
     floor = plane([0, 0, 0], [0, 0, 1], start=1.0, stop=2.0)
     q, before = np.array([[0.0, 0, -0.1]]), np.array([[0.0, 0, 0.1]])
     moved = [
-        (Exchange(floor, 1.0).exchanged(q, before, StepTaken(time, T))[0] != q).any()
+        (Exchange(floor, 1.0).struck(q, before, StepTaken(time, T))[0] != q).any()
         for time in (0.9, 1.0, 1.9, 2.0)
     ]
     assert moved == [False, True, True, False]

@@ -88,7 +88,7 @@ def test_beyond_the_far_face_a_penalty_pushes_back_with_the_whole_depth():
 def test_a_node_that_jumps_over_a_thin_plate_is_reflected_to_where_it_came_from():
     q, before = np.array([[0.1, 0, -0.4], [6.0, 0, -0.4]]), np.array([[0.0, 0, 0.1], [6.0, 0, 0.1]])
     step = StepTaken(1.0, 0.1, THIN.sides(before, q, 1.0, 0.1))
-    after, after_before = Exchange(THIN, 0.5).exchanged(q, before, step)
+    after, after_before = Exchange(THIN, 0.5).struck(q, before, step)
     np.testing.assert_allclose(after, [[0.1, 0, 0.1], [6, 0, -0.4]])
     np.testing.assert_allclose(after - after_before, [[0.1, 0, 0.25], [0, 0, -0.5]])
 

@@ -10,7 +10,7 @@ from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, to_h
 from msmpetsc.comm import reduced
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.obstacles.penalty import ObstacleContact, Penalty
-from msmpetsc.contact.obstacles.reflection import Exchange, StepTaken, slowed
+from msmpetsc.contact.obstacles.reflection import Exchange, StepTaken
 from msmpetsc.contact.step_contact import StepContact
 from msmpetsc.lattice.lattice import Lattice
 
@@ -32,9 +32,8 @@ class NodeObstacles:
         self.lattice, self.penalties, self.exchanges = lattice, penalties, exchanges
         self.all = [p.obstacle for p in penalties] + [e.obstacle for e in exchanges]
         self.has_sides = any(obstacle.solid.has_sides for obstacle in self.all)
-        # Rows of ``sides``.
+        # Rows of penalties in ``sides``
         self.pressing = slice(len(penalties))
-        self.exchanging = slice(len(penalties), None)
         self.strikes = bool(exchanges) or any(p.restitution is not None for p in penalties)
         nodes = lattice.nodes
         self.no_sides: Indices = np.zeros((len(self.all), len(nodes)), np.int8, like=nodes)
@@ -213,24 +212,18 @@ class NodeObstacles:
         step  : the completed step, with the sides (o, l) for all obstacles
         fixed : (l, 3) bool, the components that are not free
         """
-        free = ~fixed
-        work = 0.0
+        free, work = ~fixed, 0.0
         sides = self.no_sides if step.sides is None else step.sides
-        for exchange, side in zip(self.exchanges, sides[self.exchanging], strict=True):
-            after, before = exchange.exchanged(q, q_previous, replace(step, sides=side))
-            if after is not q:
-                after, before = np.where(free, after, q), np.where(free, before, q_previous)
-                work += self._impulse_work(
-                    exchange.obstacle, (after - before) - (q - q_previous), step
-                )
+        laws: list[Penalty | Exchange] = [*self.penalties, *self.exchanges]
+        for law, side in zip(laws, sides, strict=True):
+            after, before = law.struck(q, q_previous, replace(step, sides=side))
+            if before is not q_previous:
+                before = np.where(free, before, q_previous)
+                # friction continues from positions that do not change
+                after = q if after is q else np.where(free, after, q)
+                change = (after - before) - (q - q_previous)
+                work += self._impulse_work(law.obstacle, change, step)
                 q, q_previous = after, before
-        for p, side in zip(self.penalties, sides[self.pressing], strict=True):
-            if p.restitution is not None:
-                before = slowed(p.obstacle, p.restitution, q, q_previous, replace(step, sides=side))
-                if before is not q_previous:
-                    before = np.where(free, before, q_previous)
-                    work += self._impulse_work(p.obstacle, q_previous - before, step)
-                    q_previous = before
         return q, q_previous, work
 
     def _impulse_work(self, obstacle: Obstacle, change: Rows, step: StepTaken) -> float:

@@ -16,6 +16,7 @@ from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like
 from msmpetsc.contact.friction import STICK
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.obstacles.node_friction import NodeFriction, Pressed
+from msmpetsc.contact.obstacles.reflection import StepTaken, striking
 from msmpetsc.scene.obstacles import ObstacleTable
 
 # default stiffness [stiffness of the stiffest spring]; nodes then sink in by little
@@ -95,6 +96,23 @@ class Penalty:
         friction = NodeFriction(limit, stick, begin, nodes, normal, carried)
         ended = next((contact.friction for contact in before if contact.penalty is self), None)
         return replace(state, friction=friction.after(ended, q) if ended else friction)
+
+    def struck(
+        self, q: Positions, q_previous: Positions, step: StepTaken
+    ) -> tuple[Positions, Positions]:
+        """Return q_n and a q_(n-1) (n, 3) [m] that scales the normal velocity of striking nodes.
+
+        A node strikes in the step in which it reaches a face.
+        """
+        if self.restitution is None:
+            return q, q_previous
+        rows, into = striking(self.obstacle, q, q_previous, step)
+        start = step.time - step.length
+        strikes = self.obstacle.depths(q_previous, start, step.sides)[0][rows] < 0
+        if strikes.any():
+            q_previous = q_previous.copy()
+            q_previous[rows[strikes]] += (1 - self.restitution) * into[strikes]
+        return q, q_previous
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 
 The state has q_n and q_(n-1) in place of a velocity. There are two laws:
 
-- ``slowed`` scales the normal velocity of a striking node by e through a new q_(n-1). The node's
-  position stays, so no energy is added. The penalty force then reverses the velocity.
+- ``Penalty.struck`` scales the normal velocity of a striking node by e through a new q_(n-1). The
+  node's position stays, so no energy is added. The penalty force then reverses the velocity.
 - ``Exchange`` is the paper's reflection (section 5): v_(n+1) = -v_n by q_(n+1) = q_(n-1). It moves
   nodes against their springs and thereby adds energy, so it is not conservative.
 """
@@ -36,7 +36,7 @@ class Exchange:
     obstacle: Obstacle
     restitution: float
 
-    def exchanged(
+    def struck(
         self, q: Positions, q_previous: Positions, step: StepTaken
     ) -> tuple[Positions, Positions]:
         """Return q_n and q_(n-1) (n, 3) [m] after the impact.
@@ -53,25 +53,6 @@ class Exchange:
         q[rows] -= into
         q_previous[rows] += self.restitution * into
         return q, q_previous
-
-
-def slowed(
-    obstacle: Obstacle, restitution: float, q: Positions, q_previous: Positions, step: StepTaken
-) -> Positions:
-    """Return a q_(n-1) (n, 3) [m] that scales the normal velocity of striking nodes by e.
-
-    A node strikes in the step in which it reaches a face.
-
-    restitution : e [-]
-    """
-    rows, into = striking(obstacle, q, q_previous, step)
-    before = obstacle.depths(q_previous, step.time - step.length, step.sides)[0][rows]
-    rows, into = rows[before < 0], into[before < 0]
-    if len(rows) == 0:
-        return q_previous
-    q_previous = q_previous.copy()
-    q_previous[rows] += (1 - restitution) * into
-    return q_previous
 
 
 def striking(

@@ -45,9 +45,7 @@ class Environment:
         self.anchors = Anchors(model.lattice, model.anchors)
         self.obstacles = NodeObstacles(model.lattice, model.penalties, model.exchanges)
         self.moving: list[Anchor | Obstacle] = [*model.anchors, *model.obstacles]
-        self.contacts = (
-            ContactSearch(self.lattice.table.comm, model.collision) if model.collision else None
-        )
+        self.contacts = ContactSearch(model.collision) if model.collision else None
         # end positions and contact of the last step; None without contact
         self._ended: tuple[Positions, StepContact] | None = None
         self.touches = bool(model.penalties or self.contacts)

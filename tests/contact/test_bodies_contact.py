@@ -10,7 +10,6 @@ import trimesh
 from block_scene import GRAVITY, ROUGH_GROUND, loop_of, model_of, play, solid_of, write_scene
 from conftest import result_on
 from crossings import crossings
-from mpi4py import MPI
 
 import msmpetsc.contact.surface.pairs
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw
@@ -147,7 +146,7 @@ def test_a_way_is_cut_where_pairs_are_known_at_its_end_alone(folder: Path):
     assert model.collision is not None
     start = model.lattice.nodes.copy()
     end = start - np.where(model.lattice.body[:, None] == 1, [0, 0, 0.02 + 2.5 * SIDE], 0.0)
-    contacts = ContactSearch(MPI.COMM_SELF, model.collision)
+    contacts = ContactSearch(model.collision)
     contacts.find(start)
     contacts.find(end)
     free = 0.02 / (0.02 + 2.5 * SIDE)
@@ -225,14 +224,12 @@ def test_what_stores_too_little_to_count_may_be_left_out(folder: Path, monkeypat
     scene = fall(folder, "light", 0.002, time={"step": 0.01, "duration": 0.01})
     model = model_of(scene)
     assert model.collision is not None
-    contacts, start = (
-        ContactSearch(MPI.COMM_SELF, model.collision),
-        model.lattice.nodes,
-    )
+    contacts, start = ContactSearch(model.collision), model.lattice.nodes
     end = start - np.where(model.lattice.body[:, None] == 1, [0, 0, 0.002 - 0.5 * DISTANCE], 0.0)
     energy = contacts.touch(end, 0.01).energy
     for left_out, is_right in ((1.01, True), (0.99, False)):
-        assert contacts.narrow(start, 0.0) and contacts.is_left_out
+        contacts.narrow(start, 0.0)
+        assert contacts.is_left_out
         assert contacts.check_narrow_step(start, end, left_out * energy) == (True, is_right)
         assert contacts.is_narrow != is_right and not contacts.is_left_out
     assert contacts.touch(end, 0.01).energy == pytest.approx(energy)

@@ -18,7 +18,6 @@ from block_scene import (
     write_scene,
 )
 from crossings import count_crossings, crossings
-from mpi4py import MPI
 from one_process import input_error
 from scipy.spatial.transform import Rotation
 from test_contact import PRESSED, off_the_slide
@@ -204,7 +203,7 @@ def test_a_block_that_turns_with_a_table_slips_by_nothing_in_a_step_of_bdf2(tmp_
     def turned(time: float) -> np.ndarray:
         return Rotation.from_rotvec([0, 0, 2 * np.pi * time]).apply(model.lattice.nodes)
 
-    contacts = ContactSearch(MPI.COMM_SELF, model.collision)
+    contacts = ContactSearch(model.collision)
     contacts.begin_step(t, 2 * t)
     contact = SurfaceContact(contacts, turned(t), t, turned(0))
     friction = contact.friction

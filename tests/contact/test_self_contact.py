@@ -12,7 +12,6 @@ import pytest
 import trimesh
 from block_scene import GRAVITY, block_scene, model_of, play, solid_of, write_scene
 from crossings import count_crossings, crossings
-from mpi4py import MPI
 from pinch import ARM, HALF, RADIUS, pinch_scene, u_tube
 from stopped_runs import assert_goes_on_exactly
 
@@ -24,7 +23,6 @@ from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.simulate import refuse_bad_options
 
-COMM = MPI.COMM_SELF
 # gap between the arms [m]; the barrier begins at 1e-3 m
 GAP = 4e-4
 T = 0.01
@@ -50,7 +48,7 @@ def contact(model: Model, slid: float = 0.0) -> tuple[SurfaceContact, np.ndarray
     assert model.collision is not None
     end = q.copy()
     end[q[:, 0] < 0, 1] += slid
-    return SurfaceContact(ContactSearch(COMM, model.collision), q, T), end
+    return SurfaceContact(ContactSearch(model.collision), q, T), end
 
 
 # without friction, below the kink of friction, and beyond it
@@ -120,7 +118,7 @@ def test_friction_of_a_step_of_bdf2_goes_by_the_push_and_the_velocity_that_it_en
     q = closed(model)
     # the left arm moves towards the right arm and along it
     came = np.where(q[:, :1] < 0, [2e-5, 1e-4, 0.0], 0.0)
-    contacts = ContactSearch(COMM, model.collision)
+    contacts = ContactSearch(model.collision)
     now, before = (SurfaceContact(contacts, at, T).friction for at in (q, q - came))
     friction = SurfaceContact(contacts, q, T, q - came).friction
     expected = np.clip(2 * now.limit - now.values_of(before.pairs, before.limit), 0, 2 * now.limit)
@@ -135,7 +133,7 @@ def test_friction_of_a_step_of_bdf2_goes_by_the_push_and_the_velocity_that_it_en
 
 def test_friction_goes_on_from_the_slip_that_pairs_held(model):
     q = closed(model)
-    contacts = ContactSearch(COMM, model.collision)
+    contacts = ContactSearch(model.collision)
     first = SurfaceContact(contacts, q, T)
     stick, end = first.friction.stick, q.copy()
     end[q[:, 0] < 0, 1] += 0.4 * stick
@@ -204,20 +202,15 @@ def test_a_run_that_goes_on_from_a_checkpoint_is_the_same_to_the_last_bit(tmp_pa
     assert assert_goes_on_exactly(path, every=8)[9].self_contacts > 0
 
 
-def crossing_boxes(folder: Path, deep: float, subdivisions: int) -> Path:
-    """Return the scene of two bars; the first reaches into the second by a depth [m]."""
+def test_triangles_that_cut_others_at_rest_are_left_out_and_named(tmp_path, caplog):
+    """The first of two bars reaches into the second by 1 cm."""
     first = trimesh.creation.box([0.5, 0.25, 0.25])
     second = trimesh.creation.box([0.125, 0.125, 0.5])
-    second.apply_translation([0.03, 0.02, 0.125 + 0.25 - deep])
-    for _ in range(subdivisions):
+    second.apply_translation([0.03, 0.02, 0.125 + 0.25 - 0.01])
+    for _ in range(4):
         first, second = first.subdivide(), second.subdivide()
-    path = block_scene(folder, self_contact={}, time={"step": 0.01, "duration": 0.01})
-    trimesh.util.concatenate([first, second]).export(folder / "scene.ply")
-    return path
-
-
-def test_triangles_that_cut_others_at_rest_are_left_out_and_named(tmp_path, caplog):
-    path = crossing_boxes(tmp_path, 0.01, 4)
+    path = block_scene(tmp_path, self_contact={}, time={"step": 0.01, "duration": 0.01})
+    trimesh.util.concatenate([first, second]).export(tmp_path / "scene.ply")
     model = model_of(path)
     assert "triangles cut others at rest, the first at (" in caplog.text
     surface = model.collision.surface

@@ -125,8 +125,9 @@ class ContactSearch:
     is_left_out : whether the step is narrow without contacts, so that the surface is left out
     """
 
-    def __init__(self, comm: MPI.Comm, collision: CollisionSurface):
-        self.comm, self.points, self.law = comm, collision.points, collision.law
+    def __init__(self, collision: CollisionSurface):
+        self.points, self.law = collision.points, collision.law
+        self.comm = comm = collision.points.comm
         self.name_of, self.obstacles = collision.name_of, collision.points.obstacles
         self.owned, surface = collision.points.weights.shape[1], collision.surface
         self.barrier: Barrier | None = on_root(
@@ -198,10 +199,10 @@ class ContactSearch:
         ]
         return self._moments[0]
 
-    def narrow(self, q: Positions, time: float) -> bool:
+    def narrow(self, q: Positions, time: float) -> None:
         """Use only candidates around the contacts at q and a time [s], and around earlier contacts.
 
-        Return whether the step is narrow. If too many points touch, the step uses all candidates.
+        If too many points touch, the step uses all candidates.
         """
         moment, touched = self.find(q, time), None
         if self.barrier and moment.count:
@@ -216,7 +217,6 @@ class ContactSearch:
         points = self.points_at(q, self.time) if self.is_narrow and not self.is_left_out else None
         if self.barrier and points is not None and touched is not None:
             self._around = self.barrier.around(touched, points, FARTHEST * self.edge)
-        return self.is_narrow
 
     def widen(self) -> None:
         """Use all candidates from now on."""

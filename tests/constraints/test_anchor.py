@@ -150,13 +150,9 @@ def corners_of_cells_of(
     points: np.ndarray, low: np.ndarray, cell_size: float
 ) -> set[tuple[int, ...]]:
     """Return the grid indices of the corners of the cells that contain the points."""
-    found = set()
-    for point in points:
-        cell = [int((p - least) // cell_size) for p, least in zip(point, low, strict=True)]
-        found |= {
-            (cell[0] + i, cell[1] + j, cell[2] + k) for i in (0, 1) for j in (0, 1) for k in (0, 1)
-        }
-    return found
+    cells = ((points - low) // cell_size).astype(int)
+    corners = cells[:, None] + np.array([*np.ndindex(2, 2, 2)])
+    return set(map(tuple, corners.reshape(-1, 3).tolist()))
 
 
 def test_painted_points_mean_the_corners_of_their_cells(balls: Path):

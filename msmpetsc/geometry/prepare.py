@@ -1,21 +1,11 @@
-"""Prepare a surface: run named steps that repair, reduce, join or turn it, then scale and place it.
+"""Prepare a surface: repair, reduce, join or turn it in named steps, then scale and place it."""
 
-Steps are deterministic, so their results for large meshes are cached on disk.
-"""
-
-import hashlib
-import os
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from functools import wraps
-from importlib.metadata import distributions
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from zipfile import BadZipFile
 
 import numpy as np
-import pooch
 
 from msmpetsc.backend.arrays import Indices
 from msmpetsc.comm import log
@@ -41,15 +31,7 @@ LEAST_AREA_KEPT = 0.5
 MOST_CHANGED = 0.01
 # largest coordinate that is repaired [file's unit]; MeshFix crashes on larger values
 LARGEST_COORDINATE = 1e12
-# least number of triangles for caching a step [-]; steps on smaller meshes are fast
-LEAST_CACHED = 20_000
-# version of the steps in the names of cached files [-]; raise it whenever a step's
-# result changes, or old results stay in use
-VERSION = 1
-# files in the cache [-]; some megabytes each
-MOST_FILES = 32
 Step = Callable[..., Surface]
-LIBRARIES = ("fast-simplification", "manifold3d", "pymeshfix")
 
 
 def prepare(
@@ -179,15 +161,17 @@ def repair(surface: Surface) -> Surface:
         )
     if not report.closed:
         raise InputError(f"{report.boundary_edges} boundary edges could not be closed")
+    if abs(kept - 1) > MOST_CHANGED:
+        log.warning(
+            "prepare: 'repair' changed the surface's area by %+.0f%%: msmpetsc render draws it",
+            100 * (kept - 1),
+        )
     return repaired
 
 
 @about_middle
-def simplify(surface: Surface, faces: int, aggressiveness: int = 7) -> Surface:
-    """Reduce to about ``faces`` triangles (quadric decimation); a closed surface stays closed.
-
-    aggressiveness : of fast_simplification; less is slower and stays closer to the surface
-    """
+def simplify(surface: Surface, faces: int) -> Surface:
+    """Reduce to about ``faces`` triangles (quadric decimation); a closed surface stays closed."""
     surface = merge(surface)
     if faces >= len(surface.triangles):
         return surface
@@ -195,7 +179,7 @@ def simplify(surface: Surface, faces: int, aggressiveness: int = 7) -> Surface:
     import fast_simplification
 
     points, triangles = fast_simplification.simplify(
-        surface.points, surface.triangles, target_count=int(faces), agg=aggressiveness
+        surface.points, surface.triangles, target_count=int(faces)
     )
     reduced = Surface(np.asarray(points, np.float64), np.asarray(triangles, np.int64))
     used, _ = edge_use(merged_triangles(reduced))
@@ -284,7 +268,7 @@ STEPS: dict[str, Step] = {
 def _apply(surface: Surface, name: str, value: object) -> Surface:
     """Run a step and keep the groups. Raises InputError with the name of the step if it fails."""
     try:
-        result = cached(STEPS[name], surface, *([] if value is None else [value]))
+        result = STEPS[name](surface, *([] if value is None else [value]))
     except InputError as error:
         raise InputError(f"prepare: '{name}': {error}") from error
     # the libraries do not document their exceptions on bad meshes
@@ -296,39 +280,7 @@ def _apply(surface: Surface, name: str, value: object) -> Surface:
         raise InputError(f"prepare: '{name}' failed ({reason})") from error
     if len(result.triangles) == 0 or not np.isfinite(result.points).all():
         raise InputError(f"prepare: '{name}' left no usable mesh")
-    # warn here, so that a result from the cache is reported too
-    if name == repair.__name__:
-        change = examine(result).area / examine(surface).area - 1
-        if abs(change) > MOST_CHANGED:
-            log.warning(
-                "prepare: 'repair' changed the surface's area by %+.0f%%: msmpetsc render draws it",
-                100 * change,
-            )
     return result if result.groups else replace(result, groups=surface.groups)
-
-
-def cached(step: Step, surface: Surface, *values: object) -> Surface:
-    """Return the result of a step; cache it on disk if the mesh is large."""
-    # rotate moves groups, which the cache does not store
-    if len(surface.triangles) < LEAST_CACHED or step is rotate:
-        return step(surface, *values)
-    versions = [package.version for name in LIBRARIES for package in distributions(name=name)]
-    digest = hashlib.sha256(repr((VERSION, step.__name__, values, versions)).encode())
-    digest.update(surface.points.tobytes() + surface.triangles.tobytes())
-    path = Path(pooch.os_cache("msmpetsc"), "prepared", f"{digest.hexdigest()}.npz")
-    with suppress(OSError, ValueError, KeyError, EOFError, BadZipFile), np.load(path) as arrays:
-        return Surface(arrays["points"], arrays["triangles"])
-    result = step(surface, *values)
-    # the disk may be full or the home read-only
-    with suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_name(f"{path.name}.{os.getpid()}.part.npz")
-        np.savez(part, points=result.points, triangles=result.triangles)
-        # renaming is atomic, so no process reads half a file
-        part.replace(path)
-        for old in sorted(path.parent.glob("*.npz"), key=os.path.getmtime)[:-MOST_FILES]:
-            old.unlink(missing_ok=True)
-    return result
 
 
 def part_labels(surface: Surface) -> Indices:

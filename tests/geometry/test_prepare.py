@@ -1,4 +1,4 @@
-"""The prepare steps, scaling and placing; slow steps are cached, and never confused."""
+"""The prepare steps, scaling and placing."""
 
 import os
 from pathlib import Path
@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from surfaces import surface_of
 
 from msmpetsc.errors import InputError
-from msmpetsc.geometry import prepare as steps
-from msmpetsc.geometry.prepare import cached, prepare
+from msmpetsc.geometry.prepare import prepare
 from msmpetsc.geometry.readers import read_surface
 from msmpetsc.geometry.surface import Surface, examine, joined
 
@@ -31,17 +30,6 @@ def real(name: str) -> Surface:
     if not folder:
         pytest.skip("MSMPETSC_MESH_DIR is not set")
     return read_surface(Path(folder) / name)
-
-
-# 20,480 triangles
-BALL = trimesh.creation.icosphere(subdivisions=5)
-BODY = surface_of(BALL)
-
-
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch) -> Path:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    return tmp_path / "msmpetsc" / "prepared"
 
 
 def test_merge_joins_loose_triangles_and_drops_what_is_of_no_use():
@@ -99,12 +87,13 @@ def pipe(hole: float) -> Surface:
     return Surface(surface.points, surface.triangles[~lacks])
 
 
-def test_repair_tells_how_much_of_the_surface_it_changed(caplog, folder):
+def test_repair_tells_how_much_of_the_surface_it_changed(caplog):
     pytest.importorskip("pymeshfix")
+    ball = surface_of(trimesh.creation.icosphere(subdivisions=5))
     inner = trimesh.creation.icosphere(3, radius=0.9).apply_translation([0.15, 0, 0])
     inner.invert()
     crossing = joined((surface_of(trimesh.creation.icosphere(3)), surface_of(inner)))
-    small_hole = Surface(BODY.points, BODY.triangles[9:])
+    small_hole = Surface(ball.points, ball.triangles[9:])
     for surface, change in ((pipe(9.0), 0), (small_hole, 0), (pipe(0.35), 11), (crossing, -46)):
         caplog.clear()
         prepare(surface, ["repair"])
@@ -112,16 +101,6 @@ def test_repair_tells_how_much_of_the_surface_it_changed(caplog, folder):
         assert [line for line in said if line in caplog.text] == said and len(
             caplog.messages
         ) == len(said)
-    large = Surface(BODY.points, BODY.triangles[450:])
-    caplog.clear()
-    # the second result comes from the cache
-    for _ in range(2):
-        prepare(large, ["repair"])
-    assert (
-        len(set(caplog.messages)) == 1
-        and len(caplog.messages) == 2
-        and len(list(folder.iterdir())) == 2
-    )
 
 
 def test_simplify_reduces_and_stays_closed():
@@ -245,55 +224,3 @@ def test_a_step_that_leaves_nothing_is_an_error():
         prepare(point, [], size=1.0)
     with pytest.raises(InputError, match="'rotate' failed"):
         prepare(box(), [{"rotate": {"degrees": 9}}])
-
-
-class Step:
-    """A step that counts its computations."""
-
-    __name__ = "stretch"
-
-    def __init__(self):
-        self.calls = 0
-
-    def __call__(self, surface: Surface, factor: float = 2.0) -> Surface:
-        self.calls += 1
-        return Surface(surface.points * factor, surface.triangles)
-
-
-def test_a_step_is_computed_once_for_the_same_mesh_and_value_and_again_where_its_file_is_damaged(
-    folder, monkeypatch
-):
-    """Another version of the steps takes nothing from the cache."""
-    step = Step()
-    first, again = cached(step, BODY, 3.0), cached(step, BODY, 3.0)
-    assert (
-        step.calls == 1
-        and np.array_equal(first.points, again.points)
-        and again.triangles.dtype == np.int64
-    )
-    (path,) = folder.iterdir()
-    whole = path.read_bytes()
-    for damage in (b"", whole[:1000], whole[:5000] + b"x" + whole[5001:]):
-        path.write_bytes(damage)
-        assert np.array_equal(cached(step, BODY, 3.0).points, 3.0 * BODY.points)
-    moved = Surface(BODY.points + 1e-15, BODY.triangles)
-    for surface, value in (
-        (BODY, 4.0),
-        (moved, 3.0),
-        (Surface(BODY.points, BODY.triangles[::-1]), 3.0),
-    ):
-        assert np.array_equal(cached(step, surface, value).points, value * surface.points)
-    assert step.calls == 7
-    monkeypatch.setattr(steps, "VERSION", steps.VERSION + 1)
-    cached(step, BODY, 3.0)
-    assert step.calls == 8
-
-
-def test_small_meshes_are_not_kept_and_old_files_go(folder, monkeypatch):
-    step, small = Step(), Surface(BODY.points, BODY.triangles[:100])
-    cached(step, small)
-    assert step.calls == 1 and not folder.exists()
-    monkeypatch.setattr(steps, "MOST_FILES", 2)
-    for value in (1.0, 2.0, 3.0):
-        cached(step, BODY, value)
-    assert len(list(folder.iterdir())) == 2

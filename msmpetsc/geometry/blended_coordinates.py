@@ -36,7 +36,7 @@ from msmpetsc.geometry.block import (
     corner_node,
     smoothstep,
 )
-from msmpetsc.geometry.mean_value_coordinates import PointView, joined_cage, set_view
+from msmpetsc.geometry.mean_value_coordinates import joined_cage, plane_heights
 
 
 @njit()
@@ -82,13 +82,12 @@ def cages_weights(u: Rows, neighbours: Mask, smoothing: float, weights: Rows) ->
     """
     alone = np.zeros(27, np.bool_)
     alone[MIDDLE] = True
-    view = PointView(np.empty((3, 4)), np.empty(144), np.empty((108, 4)))
     blends = np.empty(8)
     joined = np.empty(64)
     for p in range(len(u)):
-        set_view(u[p], view)
+        planes = plane_heights(u[p])
         # x(p) of Eq. 7
-        joined_cage(0, alone, view, weights[p])
+        joined_cage(0, alone, planes, weights[p])
         b = own_weight(weights[p], neighbours[p], smoothing)
         if b == 1.0:
             continue
@@ -96,7 +95,7 @@ def cages_weights(u: Rows, neighbours: Mask, smoothing: float, weights: Rows) ->
         weights[p] *= b
         for v in range(8):
             if blends[v] > 0.0:
-                joined_cage(v, neighbours[p], view, joined)
+                joined_cage(v, neighbours[p], planes, joined)
                 share = (1.0 - b) * blends[v] / total
                 for node in range(64):
                     weights[p, node] += share * joined[node]

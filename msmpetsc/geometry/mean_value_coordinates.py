@@ -20,7 +20,6 @@ a system that stays well conditioned as d goes to 0.
 """
 
 from math import atan2, sqrt
-from typing import NamedTuple
 
 import numpy as np
 
@@ -35,40 +34,23 @@ Weights = tuple[float, float, float, float]
 FLAT = 1e-2
 
 
-class PointView(NamedTuple):
-    """Geometry of a point p in its block, set by ``set_view``.
-
-    planes  : (3,4) heights of the block's grid planes over p
-    angles  : (144,) g_jk of the grid edges; 0 until computed
-    squares : (108,4) weights of the grid squares; NaN until computed
-    """
-
-    planes: Rows
-    angles: Floats
-    squares: Rows
-
-
 @njit()
-def set_view(u: Floats, view: PointView) -> None:
-    """Set the planes of the point u (3,) in the view, and clear the values computed on demand."""
+def plane_heights(u: Floats) -> Rows:
+    """Return the heights (3,4) of the block's grid planes over the point u (3,)."""
+    planes = np.empty((3, 4))
     for axis in range(3):
         for i in range(4):
-            view.planes[axis, i] = i - 1 - u[axis]
-    view.angles[:] = 0.0
-    view.squares[:, 0] = np.nan
+            planes[axis, i] = i - 1 - u[axis]
+    return planes
 
 
 @njit()
-def edge_angle(edge: int, view: PointView) -> float:
+def edge_angle(edge: int, planes: Rows) -> float:
     """Return g_jk of a grid edge: the angle that the edge subtends at p, over |e_j x e_k|."""
-    if view.angles[edge] == 0.0:
-        axis, i, j, k = EDGE[edge, 0], EDGE[edge, 1], EDGE[edge, 2], EDGE[edge, 3]
-        distance2 = view.planes[(axis + 1) % 3, j] ** 2 + view.planes[(axis + 2) % 3, k] ** 2
-        cross = sqrt(distance2)
-        view.angles[edge] = (
-            atan2(cross, view.planes[axis, i] * view.planes[axis, i + 1] + distance2) / cross
-        )
-    return float(view.angles[edge])
+    axis, i, j, k = EDGE[edge, 0], EDGE[edge, 1], EDGE[edge, 2], EDGE[edge, 3]
+    distance2 = planes[(axis + 1) % 3, j] ** 2 + planes[(axis + 2) % 3, k] ** 2
+    cross = sqrt(distance2)
+    return atan2(cross, planes[axis, i] * planes[axis, i + 1] + distance2) / cross
 
 
 @njit()
@@ -133,41 +115,39 @@ def square_weights(frame: Frame, g: Angles) -> Weights:
 
 
 @njit()
-def square_frame(square: int, view: PointView) -> Frame:
+def square_frame(square: int, planes: Rows) -> Frame:
     """Return (a0, a1, b0, b1, d) of a square in the block, see ``square_weights``."""
     axis, plane, j, k = SQUARE[square, 0], SQUARE[square, 1], SQUARE[square, 2], SQUARE[square, 3]
     a, b = (axis + 1) % 3, (axis + 2) % 3
-    planes = view.planes
     return planes[a, j], planes[a, j + 1], planes[b, k], planes[b, k + 1], planes[axis, plane]
 
 
 @njit()
-def set_square(square: int, view: PointView) -> None:
-    """Set the weights of a square in the view: 0 if p lies in its plane but not on the square."""
-    a0, a1, b0, b1, d = square_frame(square, view)
+def add_square(square: int, outwards: int, planes: Rows, weights: Floats) -> None:
+    """Add the weights of a square, unless p lies in its plane but not on the square."""
+    a0, a1, b0, b1, d = square_frame(square, planes)
     if d == 0.0:
-        view.squares[square] = 0.0
         return
     cross = sqrt((a0 - b0) ** 2 + 2.0 * d * d)
     g = (
-        edge_angle(EDGES[square, 0], view),
-        edge_angle(EDGES[square, 1], view),
-        edge_angle(EDGES[square, 2], view),
-        edge_angle(EDGES[square, 3], view),
+        edge_angle(EDGES[square, 0], planes),
+        edge_angle(EDGES[square, 1], planes),
+        edge_angle(EDGES[square, 2], planes),
+        edge_angle(EDGES[square, 3], planes),
         atan2(cross, a0 * a1 + b0 * b1 + d * d) / cross,
     )
     w = square_weights((a0, a1, b0, b1, d), g)
     for i in range(4):
-        view.squares[square, i] = w[i]
+        weights[NODES[square, i]] += outwards * w[i]
 
 
 @njit()
-def set_limit(square: int, view: PointView, weights: Floats) -> bool:
+def set_limit(square: int, planes: Rows, weights: Floats) -> bool:
     """Set the barycentric weights of p if it lies on this closed square; return whether it does.
 
     They are the limit of the mean value coordinates on the cage's surface.
     """
-    a0, a1, b0, b1, d = square_frame(square, view)
+    a0, a1, b0, b1, d = square_frame(square, planes)
     if d != 0.0 or not (a0 <= 0.0 <= a1 and b0 <= 0.0 <= b1):
         return False
     weights[:] = 0.0
@@ -178,12 +158,12 @@ def set_limit(square: int, view: PointView, weights: Floats) -> bool:
 
 
 @njit()
-def joined_cage(corner: int, valid: Mask, view: PointView, weights: Floats) -> None:
+def joined_cage(corner: int, valid: Mask, planes: Rows, weights: Floats) -> None:
     """Set the mean value coordinates of p in the valid cells around a corner (L_v of Eq. 8).
 
     corner  : 0..7
     valid   : (27,) bool
-    view    : view from p
+    planes  : ``plane_heights`` over p
     weights : (64,) result
 
     The 8 cells around the corner have 36 squares. The squares with a valid cell on a single side
@@ -199,10 +179,7 @@ def joined_cage(corner: int, valid: Mask, view: PointView, weights: Floats) -> N
             AROUND[corner, above] and valid[above]
         )
         if outwards != 0:
-            if set_limit(square, view, weights):
+            if set_limit(square, planes, weights):
                 return
-            if np.isnan(view.squares[square, 0]):
-                set_square(square, view)
-            for i in range(4):
-                weights[NODES[square, i]] += outwards * view.squares[square, i]
+            add_square(square, outwards, planes, weights)
     weights /= weights.sum()

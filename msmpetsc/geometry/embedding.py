@@ -18,16 +18,12 @@ from msmpetsc.comm import Route
 from msmpetsc.geometry.blended_coordinates import affine_weights, cages_weights, gradient_table
 from msmpetsc.geometry.block import MIDDLE, NODE_STRIDE
 from msmpetsc.geometry.cages import Cages
-from msmpetsc.geometry.grid import CORNERS
+from msmpetsc.geometry.grid import CHUNK, CORNERS
 from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
 from msmpetsc.geometry.partition import SortedKeys
 
-# largest distance of a point outside its cell [cells]; above rounding
-ROUNDING = 1e-9
 # distance within which a point is moved onto a face of its cell [cells]; rounding
 ON_FACE = 1e-14
-# points in a batch [-]; bounds their weights to 16 MB
-CHUNK = 1 << 15
 # offsets of the cells and the nodes around a cell, in the order of stencil_weights
 CELLS_AROUND = np.stack(np.unravel_index(np.arange(27), (3, 3, 3)), axis=1) - 1
 NODES_AROUND = np.stack(np.unravel_index(np.arange(64), (4, 4, 4)), axis=1) - 1
@@ -137,13 +133,7 @@ def stencil_weights(kind: str, u: Rows, neighbours: Mask, smoothing: float = 1.0
     returns    : column ix*16 + iy*4 + iz is the node at (ix-1, iy-1, iz-1) from the low corner
 
     Each row sums to 1, reproduces linear fields, and is exactly 0 at nodes of no valid cell.
-
-    Raises ValueError for points outside their cell, or in cells that are not valid.
     """
-    if not np.all((u >= -ROUNDING) & (u <= 1.0 + ROUNDING)):
-        raise ValueError("a point lies outside its cell")
-    if not np.all(neighbours[:, MIDDLE]):
-        raise ValueError("a point lies in a cell that is not valid")
     u = np.ascontiguousarray(np.where(u < ON_FACE, 0.0, np.where(u > 1.0 - ON_FACE, 1.0, u)))
     # a single memory layout, so that the kernels are compiled once
     neighbours = np.ascontiguousarray(neighbours, bool)

@@ -16,7 +16,7 @@ from msmpetsc.comm import Route, log, on_root
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.cell_parts import CellParts, parts_of
 from msmpetsc.geometry.copies import NO_COPIES, Copies, find_copies
-from msmpetsc.geometry.fill_fractions import LEAK, OUTSIDE, Columns, sampled_inside
+from msmpetsc.geometry.fill_fractions import LEAK, Columns, sampled_inside
 from msmpetsc.geometry.grid import CHUNK, CORNERS, BodyGrids, Grid, packed, unpacked
 from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
 from msmpetsc.geometry.partition import SortedKeys, places_of, ranges
@@ -34,8 +34,6 @@ BOUNDARY, INTERIOR = 1, 2
 LEAST_FILL = 1e-3
 # fill from which a corner counts as full [-]; the difference from 1 is rounding
 FULL = 1 - 1e-9
-# accepted relative error of a cell count [-]; far below the lattice's own error
-TOLERANCE = 0.01
 # relative error of a body's mass from which a warning is logged [-]; far above rounding
 MASS_TOLERANCE = 0.02
 
@@ -311,7 +309,7 @@ def _slab_cells(body: BodySurface, grid: Grid) -> SlabCells:
         columns = Columns.crossed(outwards, *limits)
         if body.comm.allreduce(columns.leak, MPI.MAX) < LEAK:
             gaps = gaps_between(touched)
-            is_inside_body = columns.inside(gaps[:, [0, 1, 3]])[0][:, 0, 0, 0] > OUTSIDE
+            is_inside_body = columns.inside(gaps[:, [0, 1, 3]])[0][:, 0, 0, 0] > 0.5
             return SlabCells(touched, gaps[is_inside_body], columns)
     return SlabCells(touched, _gaps_by_winding(body, grid, axes, edges, touched), None)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from msmpetsc.comm import log
 from msmpetsc.errors import InputError, body_names
-from msmpetsc.geometry.cages import TOLERANCE, BodySurface, slabs_of_all
+from msmpetsc.geometry.cages import BodySurface, slabs_of_all
 from msmpetsc.geometry.grid import BodyGrids
 from msmpetsc.geometry.thickness import ADVISED, ENOUGH
 from msmpetsc.scene.body import SOLID
@@ -38,7 +38,7 @@ def choose_cell_size(
         slabs = slabs_of_all(bodies, grids, 20 * max_cells)
         excess[guess] = np.log(sum(cells.count(comm) for cells in slabs) / count)
         nearest = min(excess, key=lambda size: abs(excess[size]))
-        if abs(np.expm1(excess[nearest])) <= TOLERANCE:
+        if abs(np.expm1(excess[nearest])) <= 0.01:
             return float(np.exp(nearest))
         guess = _next_guess(excess, nearest)
     log.warning(

@@ -33,8 +33,6 @@ from msmpetsc.geometry.valid_cells import clip_between, extent, grown
 
 # samples along an axis of a cut cell [-]; the fill beside a plane errs by 0.6% rms
 SAMPLES = 6
-# winding number below which a cell is outside [-]; halfway between outside and inside
-OUTSIDE = 0.5
 # least winding number below a column that shows inconsistent winding [-]; far above
 # rounding, far below the effect of a single triangle
 LEAK = 1e-6

@@ -9,6 +9,7 @@ import numpy as np
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.morton import LIMIT, SIDE_LIMIT
+from msmpetsc.geometry.surface import SINGLE
 
 PACK = np.array([LIMIT**2, LIMIT, 1])
 # corners of a cell [cell]; in VTK's hexahedron order, as in the result file
@@ -17,10 +18,8 @@ CORNERS = np.array(
 )
 # triangles or cells in a batch [-]; bounds the memory of a pass
 CHUNK = 1 << 17
-# distance within which a coordinate is moved onto a grid plane, relative to the longest
-# side [-]; above the rounding of meshes in single precision
-ON_PLANE = 1e-6
-# upper limit of this distance [cells]; far below a cell
+# greatest distance by which a coordinate is moved onto a grid plane [cells]; far below a
+# cell. On grids of fewer than a thousand cells the limit is SINGLE of the longest side.
 MOST_ON_PLANE = 1e-3
 
 
@@ -43,7 +42,7 @@ class Grid:
         Raises InputError if the cell size is too small to number the cells along an axis.
         """
         length = (bounds[1] - bounds[0]) / cell_size
-        cells = np.ceil(length - min(ON_PLANE * length.max(), MOST_ON_PLANE))
+        cells = np.ceil(length - min(SINGLE * length.max(), MOST_ON_PLANE))
         if not cells.max() < SIDE_LIMIT - 1:
             raise InputError(
                 f"cages.cell_size: {cell_size:g} m would cut the body into {cells.max():.3g} cells "
@@ -59,7 +58,7 @@ class Grid:
         inside = np.nextafter(self.shape.astype(float), 0)
         at = (points - self.origin) / self.cell_size
         plane = np.rint(at)
-        is_on_plane = np.abs(at - plane) <= min(ON_PLANE * self.shape.max(), MOST_ON_PLANE)
+        is_on_plane = np.abs(at - plane) <= min(SINGLE * self.shape.max(), MOST_ON_PLANE)
         return np.clip(np.where(is_on_plane, plane, at), 0, inside)
 
     def node_positions(self, ijk: Array) -> Positions:

@@ -3,11 +3,8 @@
 import numpy as np
 
 from msmpetsc.backend.arrays import Indices, Mask, Positions, Rows
+from msmpetsc.geometry.surface import SINGLE
 from msmpetsc.scene.body import Region
-
-# distance within which a point counts as on the edge, relative to the longest side [-];
-# many meshes have single precision
-EDGE = 1e-6
 
 
 def inside(region: Region, points: Positions, bounds: Rows) -> Mask:
@@ -21,7 +18,7 @@ def inside(region: Region, points: Positions, bounds: Rows) -> Mask:
     if region.relative:
         origin, scale = bounds[0], bounds[1] - bounds[0]
         length = scale.max()
-    edge = EDGE * (bounds[1] - bounds[0]).max()
+    edge = SINGLE * (bounds[1] - bounds[0]).max()
     if region.box is not None:
         low, high = origin + np.array(region.box) * scale
         low = np.where(low <= bounds[0] + edge, -np.inf, low)

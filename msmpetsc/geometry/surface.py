@@ -9,9 +9,9 @@ from msmpetsc.backend.arrays import Array, Indices, Mask, Positions, Rows
 from msmpetsc.comm import starts
 from msmpetsc.errors import InputError
 
-# thickness below which a body counts as flat, relative to its longest side [-]; ten
-# times the rounding of coordinates in single precision
-FLAT = 1e-6
+# tolerance of coordinates, relative to the longest side of the body [-]; ten times the
+# rounding of meshes in single precision
+SINGLE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -116,8 +116,8 @@ def check_encloses(surface: Surface, report: SurfaceReport) -> list[str]:
     """Return a line for each fault that makes the inside of a surface doubtful, with its remedy.
 
     The flatness is measured along the principal axes, so that a tilted sheet also counts as flat.
-    A closed surface is also flat if its mean thickness 2 |volume| / area is at most FLAT of its
-    longest side.
+    A closed surface is also flat if its mean thickness 2 |volume| / area is at most SINGLE of
+    its longest side.
 
     Raises InputError if the surface encloses no volume.
     """
@@ -125,9 +125,9 @@ def check_encloses(surface: Surface, report: SurfaceReport) -> list[str]:
     if len(points) < 4:
         raise InputError("the mesh encloses no volume: it has fewer than four points")
     sides = np.ptp(points @ np.linalg.svd(np.cov(points.T))[0], axis=0)
-    if sides.min() <= FLAT * sides.max():
+    if sides.min() <= SINGLE * sides.max():
         raise InputError("the mesh encloses no volume: it is flat")
-    if report.closed and 2 * abs(report.volume) <= FLAT * report.area * sides.max():
+    if report.closed and 2 * abs(report.volume) <= SINGLE * report.area * sides.max():
         raise InputError(
             "the mesh encloses no volume: it is folded onto itself, or its parts are wound "
             'against each other (for the latter: prepare = ["orient"])'

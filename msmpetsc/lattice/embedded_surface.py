@@ -16,6 +16,7 @@ from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.comm import Route, on_root
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.embedding import embed
+from msmpetsc.geometry.grid import MOST_ON_PLANE
 from msmpetsc.geometry.surface import Surface, compact, first_of_equal
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.region import Finder, groups_named
@@ -24,8 +25,6 @@ from msmpetsc.scene.schema import OfBody
 
 # triangles from which a surface is not refined further [-]; bounds the memory
 MOST_TRIANGLES = 1_000_000
-# distance outside the body's bounding box that counts as rounding [cells]
-EDGE = 1e-6
 NO_SURFACE = Surface(np.empty((0, 3)), np.empty((0, 3), np.int64))
 
 
@@ -157,10 +156,8 @@ def surface_part(table: OfBody, finder: Finder, lattice: Lattice) -> SurfacePart
         part = compact(surface.points, surface.triangles[where][:, :: -1 if inwards else 1])
         low, high = finder.bounds[number]
         # refused here, because the grid would move points outside onto its faces
-        if (
-            np.maximum(low - part.points, part.points - high).max(initial=0)
-            > EDGE * lattice.cell_size
-        ):
+        outside = np.maximum(low - part.points, part.points - high).max(initial=0)
+        if outside > MOST_ON_PLANE * lattice.cell_size:
             raise left
         return _refined(part, 0.5 * lattice.cell_size)
 

@@ -21,9 +21,9 @@ from msmpetsc.comm import Route, log, on_root
 from msmpetsc.errors import InputError, did_you_mean, printable
 from msmpetsc.geometry.cages import BodySurface, Cages, marked_cells
 from msmpetsc.geometry.embedding import cells_at
-from msmpetsc.geometry.inside import EDGE, inside_bodies
+from msmpetsc.geometry.inside import inside_bodies
 from msmpetsc.geometry.morton import COPIES, encode_morton
-from msmpetsc.geometry.surface import Surface, bounds_of, examine, is_inside
+from msmpetsc.geometry.surface import SINGLE, Surface, bounds_of, examine, is_inside
 from msmpetsc.lattice.cell_samples import COUNT, CellSamples
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.nearest_points import NodePoints, nearest_in_bodies
@@ -247,7 +247,7 @@ def _are_on(surface: Surface, points: Positions) -> Mask:
 
     squares = igl.point_mesh_squared_distance(points, surface.points, surface.triangles)[0]
     low, high = bounds_of(surface)
-    on: Mask = squares <= (EDGE * (high - low).max()) ** 2
+    on: Mask = squares <= (SINGLE * (high - low).max()) ** 2
     return on
 
 

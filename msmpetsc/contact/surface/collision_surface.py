@@ -19,9 +19,8 @@ from msmpetsc.contact.surface.points import SurfacePoints
 from msmpetsc.errors import InputError, body_names
 from msmpetsc.geometry.cages import BodySurface, Cages
 from msmpetsc.geometry.embedding import embed
-from msmpetsc.geometry.grid import ON_PLANE
 from msmpetsc.geometry.prepare import simplify
-from msmpetsc.geometry.surface import Surface, compact, have_three_corners, joined, outward
+from msmpetsc.geometry.surface import SINGLE, Surface, compact, have_three_corners, joined, outward
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.obstacles import SelfContactTable
 from msmpetsc.scene.reading import Scene
@@ -112,9 +111,9 @@ def _prepared(
         bodies, off = coarser, _off(bodies, coarser, table.distance or 0.0)
     if meets_itself:
         longest = max(float(np.linalg.norm(np.ptp(body.points, axis=0))) for body in bodies)
-        # Points within ON_PLANE of a plane of the grid snap to the plane, which would
+        # Points within SINGLE of a plane of the grid snap to the plane, which would
         # close a smaller gap
-        gap = max(NEAREST * (table.distance or NEAR * longest), 2 * ON_PLANE * longest)
+        gap = max(NEAREST * (table.distance or NEAR * longest), 2 * SINGLE * longest)
         bodies = _without_crossing_triangles(_parted(bodies, gap), table.surface is not None)
     ends = np.concatenate(
         [b.points[b.triangles] - b.points[np.roll(b.triangles, 1, axis=1)] for b in bodies]

@@ -45,9 +45,9 @@ SIDE = 6
 # --- boundary cells ---
 
 
-def cells_of(corners: np.ndarray, low=(0, 0, 0), high=(SIDE,) * 3) -> set[tuple[int, ...]]:
+def cells_of(corners: np.ndarray) -> set[tuple[int, ...]]:
     triangles = np.atleast_3d(corners).reshape(-1, 3, 3)
-    keys, _ = touched_cells(triangles, np.array(low), np.array(high))
+    keys, _ = touched_cells(triangles, np.zeros(3, int), np.full(3, SIDE))
     return set(map(tuple, unpacked(keys).tolist()))
 
 
@@ -87,22 +87,6 @@ often_on_planes = st.integers(0, SIDE * 4 - 1).map(lambda x: 16 * x)
 )
 def test_touched_cells_are_those_of_a_separating_axis_test(triangle):
     assert boxes_touched(triangle, 1) <= cells_of(triangle / UNIT) <= boxes_touched(triangle, 0)
-
-
-def test_cells_outside_the_limits_are_left_out():
-    rng = np.random.default_rng(3)
-    triangles = rng.uniform(0, SIDE, (40, 1, 3)) + rng.uniform(-1, 1, (40, 3, 3)) * rng.choice(
-        [0.01, 2], (40, 1, 1)
-    )
-    everywhere = cells_of(triangles, (-9,) * 3, (20,) * 3)
-    low, high = (1, 2, 3), (4, 5, 5)
-    within = {
-        cell
-        for cell in everywhere
-        if all(a <= c < b for a, c, b in zip(low, cell, high, strict=True))
-    }
-    assert cells_of(triangles, low, high) == within != everywhere
-    assert cells_of(triangles, low, low) == set()
 
 
 # --- interior cells ---

@@ -19,10 +19,8 @@ from surfaces import body_of
 
 from msmpetsc import open as open_result
 from msmpetsc.geometry.cages import Cages, fill
-from msmpetsc.geometry.copies import Copies
 from msmpetsc.geometry.embedding import embed
-from msmpetsc.geometry.grid import CORNERS
-from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
+from msmpetsc.geometry.morton import decode_morton
 from msmpetsc.lattice.topology import Topology, topology_of
 from msmpetsc.view.drawable import drawable_of_result
 from msmpetsc.view.mesh import drawn
@@ -45,18 +43,6 @@ def fork(slit: float, shift: float = 0.0) -> trimesh.Trimesh:
     bar = box([0, 0, 0], [LENGTH, WIDTH, DEPTH])
     gap = box([BASE, middle - slit / 2, -1], [LENGTH + 1, middle + slit / 2, DEPTH + 1])
     body = trimesh.boolean.difference([bar, gap], engine="manifold")
-    body.apply_scale(H)
-    return body.subdivide_to_size(1.5 * H)
-
-
-def folded_sheet(gap: float) -> trimesh.Trimesh:
-    """Return a folded sheet: two layers of 0.7 cells that are connected at x = 0."""
-    layers = [
-        box([0, 0, 0.13], [12, 4, 0.83]),
-        box([0, 0, 0.83 + gap], [12, 4, 1.53 + gap]),
-        box([0, 0, 0.13], [1, 4, 1.53 + gap]),
-    ]
-    body = trimesh.boolean.union(layers, engine="manifold")
     body.apply_scale(H)
     return body.subdivide_to_size(1.5 * H)
 
@@ -197,12 +183,9 @@ def test_the_surface_follows_its_own_part(tmp_path: Path):
 def pulled(folder: Path, mesh: trimesh.Trimesh, low: list, high: list, **tables: object) -> Path:
     """Write a static scene: a body held at x = 0, whose parts in two boxes are pulled apart."""
     mesh.export(folder / "body.ply")
-    axis = 1 if mesh.extents[2] < 0.25 and mesh.extents[1] > 0.45 else 2
-    pull = [0.0, 0.0, 0.0]
-    pull[axis] = FORCE
     forces = [
-        {"region": {"box": low}, "total": [-f for f in pull]},
-        {"region": {"box": high}, "total": pull},
+        {"region": {"box": box}, "total": [0.0, pull, 0.0]}
+        for box, pull in ((low, -FORCE), (high, FORCE))
     ]
     scene = {
         "mesh": {"source": "body.ply"},
@@ -295,24 +278,6 @@ def test_the_surface_drawn_follows_its_own_part(tmp_path: Path):
     np.testing.assert_array_equal(np.sign(aside), np.sign(points[far, 1] - WIDTH * H / 2))
 
 
-def sheet_opening(folder: Path, gap: float) -> float:
-    """Return how far the free ends of a folded sheet move apart [m]."""
-    folder.mkdir()
-    low, high = [[1.1, -1, 0], [2, 1, 0.09]], [[1.1, -1, 0.1], [2, 1, 1]]
-    path = pulled(folder, folded_sheet(gap), low, high)
-    model, frames = play(path, "force.0.total=[0, 0, -0.005]", "force.1.total=[0, 0, 0.005]")
-    points = model.surface.points
-    end, up = points[:, 0] > 12 * H - 1e-6, (frames[-1].surface - points)[:, 2]
-    above = points[:, 2] > (0.83 + gap / 2) * H
-    return float(up[end & above].mean() - up[end & ~above].mean())
-
-
-def test_the_layers_of_a_folded_sheet_move_apart(tmp_path: Path):
-    """A gap of a quarter of a cell opens like a gap of 1.2 cells, which needs no copies."""
-    narrow, wide = (sheet_opening(tmp_path / str(gap), gap) for gap in (0.25, 1.2))
-    assert narrow == pytest.approx(wide, rel=0.05)
-
-
 def spiral(thickness: float, gap: float) -> tuple[trimesh.Trimesh, np.ndarray, float]:
     """Return a tilted sheet rolled up in 2.5 turns [cells], the middles of its ends, its length."""
     angle = np.linspace(0, 5 * np.pi, 161)
@@ -371,15 +336,3 @@ def test_lips_part_along_an_arched_slit(tmp_path: Path, gap: float):
         return float(up[near & (above > 0)].mean() - up[near & (above < 0)].mean())
 
     assert parted() == pytest.approx(parted("cages.cell_size=0.05"), rel=0.1)
-
-
-def test_corner_keys_of_ordinary_cells_are_those_of_their_index():
-    cells = np.array([[3, 1, 4], [1, 5, 9]])
-    keys = encode_morton(cells)
-    ordinary = encode_morton(cells[:, None] + CORNERS)
-    own = ordinary[1] + 1
-    copies = Copies(keys[1:] + 1, own[None])
-    asked = np.array([keys[0], keys[1], keys[1] + 1])
-    found = copies.corner_keys(asked, cells[[0, 1, 1]])
-    np.testing.assert_array_equal(found, [*ordinary, own])
-    assert (decode_morton(found) == decode_morton(found // COPIES * COPIES)).all()

@@ -304,13 +304,3 @@ def test_a_mesh_opens_no_other_file(tmp_path, opened, kind):
     opened.clear()
     assert len(read_surface(tmp_path / f"x.{kind}").triangles) == 12
     assert [name for name in opened if str(tmp_path) in name] == [str(tmp_path / f"x.{kind}")]
-
-
-def test_what_is_instanced_as_people_do_it_is_read(tmp_path):
-    scene = trimesh.Scene({"box": BOX})
-    for node in range(99):
-        scene.graph.update(f"node {node}", geometry="box")
-    scene.export(tmp_path / "x.glb")
-    # the mesh is written once
-    assert (tmp_path / "x.glb").stat().st_size < 10_000
-    assert len(read_surface(tmp_path / "x.glb").triangles) == 1200

@@ -1,6 +1,5 @@
 """Regions by the names in a mesh: in every format, after every step of prepare, on any ranks."""
 
-from itertools import product
 from pathlib import Path
 
 import h5py
@@ -15,7 +14,7 @@ from obj_files import write_obj, write_parts
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.readers import read_surface
-from msmpetsc.geometry.surface import Surface, examine
+from msmpetsc.geometry.surface import examine
 from msmpetsc.lattice.probes import probe_points
 from msmpetsc.scene.schema import Probe
 
@@ -268,13 +267,3 @@ def test_a_glb_node_has_what_hangs_at_it(tmp_path: Path):
     assert examine(surface.groups["side"]).closed and examine(surface).volume == pytest.approx(
         SIDES.prod()
     )
-
-
-def test_moving_a_surface_moves_its_groups():
-    triangle = np.array([[0, 1, 2]])
-    for shift, size in product((0.0, 2.0), repeat=2):
-        inner = Surface(np.eye(3), triangle)
-        moved = Surface(np.eye(3), triangle, {"a": inner}).moved(
-            lambda points, s=shift, k=size: k * points + s
-        )
-        assert np.array_equal(moved.groups["a"].points, moved.points)

@@ -19,7 +19,7 @@ CORNERS = np.array(
 # triangles or cells in a batch [-]; bounds the memory of a pass
 CHUNK = 1 << 17
 # greatest distance by which a coordinate is moved onto a grid plane [cells]; far below a
-# cell. On grids of fewer than a thousand cells the limit is SINGLE of the longest side.
+# cell. Along fewer than a thousand cells the limit is SINGLE of the longest side.
 MOST_ON_PLANE = 1e-3
 
 

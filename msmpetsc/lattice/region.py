@@ -17,7 +17,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Indices, Mask, Positions, Rows
-from msmpetsc.comm import Route, log, on_root
+from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, did_you_mean, printable
 from msmpetsc.geometry.cages import BodySurface, Cages, marked_cells
 from msmpetsc.geometry.embedding import cells_at
@@ -143,17 +143,10 @@ class Finder:
         """
         is_within = np.ones((len(rows), COUNT), bool)
         cut = cells.cut(rows)
-        points = [np.zeros((0, 3)), *(points for _, points in cells.points(cut))]
-        to_root = Route(self.comm, np.zeros(COUNT * len(cut), np.int64))
-        given = to_root.send(np.concatenate(points))
-        body = to_root.send(np.repeat(cells.body[cut], COUNT))
-        where = np.zeros(len(given), bool)
-        for number in np.unique(body):
-            surface = self.bodies[number].surface
-            # only rank 0 receives points, and it has the surfaces
-            assert surface is not None
-            where[body == number] = is_inside(surface, given[body == number])
-        is_within[np.isin(rows, cut)] = to_root.answer(where).reshape(-1, COUNT)
+        given = np.concatenate([np.zeros((0, 3)), *(points for _, points in cells.points(cut))])
+        nearest = nearest_in_bodies(self.bodies, given, np.repeat(cells.body[cut], COUNT))
+        # a point inside is its own nearest point
+        is_within[np.isin(rows, cut)] = (nearest == given).all(axis=1).reshape(-1, COUNT)
         is_within[~is_within.any(axis=1)] = True
         shares: Rows = is_within / is_within.sum(axis=1, keepdims=True)
         return shares

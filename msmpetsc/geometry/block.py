@@ -110,8 +110,7 @@ def corner_blend(v: int, u: Floats) -> float:
     """Return W(v, p) of Eq. 8: the product over the axes of smoothstep(1 - distance to v).
 
     The 8 values sum to 1. On a face of the cell only its 4 corners have a weight, and the normal
-    derivative of each W is 0. So if two cells share the face and have the same L_v of Eq. 8 at its
-    corners, position and slope are continuous across it.
+    derivative of each W is 0.
     """
     product = 1.0
     for axis in range(3):

@@ -165,7 +165,8 @@ def _rows_in_cells(
     flush = _flush(corners, triangle, keys, cell)
     in_cell, one, other = _edges_in_cells(surface, at, touched)
     number = np.append(np.argsort(order), -1)[places_of(cycled, in_cell)]
-    ends = _ends_of_edges(codes, size, number, one, other)
+    ends = np.stack([places_of(codes, number * size + at_edge) for at_edge in (one, other)])
+    ends = ends[:, (number >= 0) & (ends >= 0).all(axis=0)]
     return keys, codes, flush, ends, corners
 
 
@@ -203,18 +204,6 @@ def _flush(corners: Rows, triangle: Indices, keys: Indices, cell: Indices) -> Ar
     for axis, index in enumerate(unpacked(keys).T):
         bits |= (top[triangle, axis] == index[cell]).astype(np.uint8) << axis
     return bits
-
-
-def _ends_of_edges(
-    codes: Indices, size: int, number: Indices, one: Indices, other: Indices
-) -> Indices:
-    """Return the pairs of rows (2, e) that a mesh edge joins in a cell.
-
-    number     : (e,) number of the cell, -1 if there is none
-    one, other : (e,) triangles at the edge
-    """
-    ends = np.stack([places_of(codes, number * size + triangle) for triangle in (one, other)])
-    return ends[:, (number >= 0) & (ends >= 0).all(axis=0)]
 
 
 def _pieces(cell: Indices, cells: int, joined: Indices) -> tuple[Indices, Indices]:

@@ -123,9 +123,7 @@ def _around(cages: Cages, keys: Indices) -> tuple[Mask, Indices]:
 def stencil_weights(kind: str, u: Rows, neighbours: Mask, smoothing: float = 1.0) -> Rows:
     """Return the weights (p,64) of the nodes around points in valid cells; lengths in cell sizes.
 
-    kind       : "mvc", mean value coordinates in the cell, continuous (Eq. 1-6); "cages", smooth
-                 blends of coordinates in joined cells (Eq. 7-9); "affine", smooth blends of affine
-                 maps, the most accurate; "trilinear", the interpolation in a solid's cell
+    kind       : one of the module's coordinates
     u          : (p,3) coordinates in the cell, in [0,1]
     neighbours : (p,27) bool, whether the cell at offset (dx, dy, dz) is valid, in the column
                  (dx+1)*9 + (dy+1)*3 + (dz+1)

@@ -18,8 +18,8 @@ CORNERS = np.array(
 )
 # triangles or cells in a batch [-]; bounds the memory of a pass
 CHUNK = 1 << 17
-# greatest distance by which a coordinate is moved onto a grid plane [cells]; far below a
-# cell. Along fewer than a thousand cells the limit is SINGLE of the longest side.
+# greatest shift of a coordinate onto a plane of the grid [cells]; far less than a cell.
+# Along fewer than a thousand cells, SINGLE of the longest side limits the shift.
 MOST_ON_PLANE = 1e-3
 
 
@@ -70,10 +70,7 @@ class Grid:
 class BodyGrids:
     """Grids of several bodies with a common cell size, numbered as a single grid.
 
-    The grid of body b is shifted by b times ``room`` cells along the first axis. So no two bodies
-    share a cell or a node. ``room`` is a power of two, more than twice the longest side of any
-    body. Hence bodies follow each other along the Morton curve, each in its own order. A cell of a
-    coarser grid belongs to a single body until it is as large as a body.
+    The grid of body b is shifted by b times ``room`` cells along the first axis (README: cages).
     """
 
     grids: tuple[Grid, ...]

@@ -10,8 +10,6 @@ from hypothesis.extra.numpy import arrays
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.surface import Surface, check_encloses, examine, first_of_equal
 
-# name: points, triangles, boundary edges, non-manifold edges (from notes of their
-# authors)
 SIDES = (1.0, 2.0, 3.0)
 
 

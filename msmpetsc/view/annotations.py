@@ -26,26 +26,21 @@ def typeface(size: int) -> ImageFont.FreeTypeFont:
     )
 
 
-def caption_picture(caption: tuple[str, str], width: int, letters: float = 1.0) -> Array:
-    """Return the picture (height, width, 3) of two centred lines.
-
-    letters : scale of the type, 1 in a contact sheet
-    """
-    picture = Image.new("RGB", (width, round(letters * CAPTION)), "white")
+def caption_picture(caption: tuple[str, str], width: int) -> Array:
+    """Return the picture (CAPTION, width, 3) of two centred lines."""
+    picture = Image.new("RGB", (width, CAPTION), "white")
     for text, (size, middle) in zip(caption, LINES, strict=True):
-        at = width / 2, letters * middle
-        ImageDraw.Draw(picture).text(at, text, INK, typeface(round(letters * size)), anchor="mm")
+        at = width / 2, middle
+        ImageDraw.Draw(picture).text(at, text, INK, typeface(size), anchor="mm")
     return np.array(picture)
 
 
 # a legend's line height, gap between entries, and type size [px]
 LINE, GAP, TYPE_SIZE = 34, 36, 15
 # width of the symbol in front of an entry's text [px]
-WIDTHS = {"bar": 220, "swatch": 22, "glass": 22, "arrow": 30}
+WIDTHS = {"bar": 220, "swatch": 22, "glass": 22, "arrow": 22}
 # first and last row of a bar and of a tick; middle and type size of its number [px]
 BAR, TICK, NUMBER = (5, 17), (14, 20), (27, 12)
-# factor by which a legend is drawn larger before it is reduced [-]; for smooth edges
-SUPERSAMPLING = 3
 
 
 @dataclass(frozen=True)
@@ -90,73 +85,51 @@ def entries_of(composition: Composition, stills: Sequence[Still]) -> list[Entry]
     return entries
 
 
-def legend_picture(entries: Sequence[Entry], width: int, letters: float = 1.0) -> Array:
-    """Return the picture (height, width, 3) of legend entries, wrapped into lines.
-
-    letters : scale of the type, 1 in a contact sheet
-    """
-    room = SUPERSAMPLING * round(width / letters)
+def legend_picture(entries: Sequence[Entry], width: int) -> Array:
+    """Return the picture (height, width, 3) of legend entries, wrapped into lines."""
     lines: list[list[Image.Image]] = []
-    for entry in (_reduced(_entry_picture(entry), room) for entry in entries):
-        if not lines or sum(each.width for each in (*lines[-1], entry)) > room:
+    for entry in map(_entry_picture, entries):
+        # an entry wider than the legend shrinks
+        entry.thumbnail((width, LINE), Image.Resampling.LANCZOS)
+        if not lines or sum(each.width for each in (*lines[-1], entry)) > width:
             lines.append([])
         lines[-1].append(entry)
-    if not lines:
-        return np.empty((0, width, 3), np.uint8)
-    picture = Image.new("RGB", (room, SUPERSAMPLING * LINE * len(lines)), "white")
+    picture = Image.new("RGB", (width, LINE * len(lines)), "white")
     for number, line in enumerate(lines):
-        left = (room - sum(each.width for each in line)) // 2
+        left = (width - sum(each.width for each in line)) // 2
         for entry in line:
-            above = (SUPERSAMPLING * LINE - entry.height) // 2
-            picture.paste(entry, (left, SUPERSAMPLING * LINE * number + above))
+            picture.paste(entry, (left, LINE * number + (LINE - entry.height) // 2))
             left += entry.width
-    return np.array(
-        picture.resize((width, round(letters * LINE * len(lines))), Image.Resampling.LANCZOS)
-    )
-
-
-def _reduced(picture: Image.Image, width: int) -> Image.Image:
-    """Return a picture reduced to at most a width [px]."""
-    if picture.width <= width:
-        return picture
-    return picture.resize(
-        (width, round(picture.height * width / picture.width)), Image.Resampling.LANCZOS
-    )
+    return np.array(picture)
 
 
 def _entry_picture(entry: Entry) -> Image.Image:
-    """Return the enlarged picture of a legend entry, with half a gap on either side."""
-    fine = SUPERSAMPLING
-    font = typeface(fine * TYPE_SIZE)
-    middle, left, half = fine * LINE / 2, fine * GAP / 2, 8 * fine
+    """Return the picture of a legend entry, with half a gap on either side."""
+    font = typeface(TYPE_SIZE)
+    left, middle = GAP // 2, LINE // 2
+    right = left + WIDTHS[entry.kind]
     # a bar's last number needs room
-    gap = (18 if entry.ticks else 8) * fine
-    width = fine * WIDTHS[entry.kind]
-    right = left + width
-    picture = Image.new(
-        "RGB", (round(right + gap + font.getlength(entry.text) + left), fine * LINE), "white"
-    )
+    text = right + (18 if entry.ticks else 8)
+    width = round(text + font.getlength(entry.text) + left)
+    picture = Image.new("RGB", (width, LINE), "white")
     draw = ImageDraw.Draw(picture)
-    box = (left, middle - half, right, middle + half)
+    box = (left, middle - 8, right, middle + 8)
     if entry.kind == "bar":
-        top, bottom = (fine * row for row in BAR)
-        for pixel in range(round(left), round(right)):
-            colour = tuple(SCALE_TABLE[int(255 * (pixel - left) / width)].tolist())
-            draw.line((pixel, top, pixel, bottom), colour)
-        row, size = (fine * number for number in NUMBER)
+        top, bottom = BAR
+        bar = Image.fromarray(SCALE_TABLE[None]).resize((WIDTHS["bar"], bottom - top))
+        picture.paste(bar, (left, top))
+        row, size = NUMBER
         for share, number in entry.ticks:
-            at = left + share * width
-            draw.line((at, fine * TICK[0], at, fine * TICK[1]), INK, fine)
+            at = left + share * WIDTHS["bar"]
+            draw.line((at, TICK[0], at, TICK[1]), INK)
             draw.text((at, row), number, INK, typeface(size), anchor="mm")
     elif entry.kind == "swatch":
         draw.rectangle(box, entry.colour)
     elif entry.kind == "glass":
-        draw.rectangle(box, "#e3e9ed", GLASS_EDGE, fine)
+        draw.rectangle(box, "#e3e9ed", GLASS_EDGE)
     elif entry.kind == "arrow":
-        draw.line((left, middle, right - half, middle), entry.colour, 2 * fine)
-        draw.polygon(
-            [(right, middle), (right - 2 * half, middle - half), (right - 2 * half, middle + half)],
-            entry.colour,
+        draw.text(
+            (left, middle), "\N{BLACK RIGHTWARDS ARROW}", entry.colour, typeface(24), anchor="lm"
         )
-    draw.text((right + gap, middle), entry.text, INK, font, anchor="lm")
+    draw.text((text, middle), entry.text, INK, font, anchor="lm")
     return picture

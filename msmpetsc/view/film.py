@@ -24,9 +24,6 @@ from msmpetsc.view.renderer import Renderer
 # default longer side of the view, and least width and height for legible captions [px]
 LONGEST = 960
 SHORTEST = np.array([240, 96])
-# least width and height for type of full size [px], and smallest scale of type [-]
-FULL_TYPE_SIDES = np.array([480, 720])
-SMALLEST_TYPE = 0.5
 # highest frame rate [1/s]
 MAX_FPS = 30.0
 # range of a film's default length, and greatest length [s]
@@ -111,15 +108,8 @@ def _default_size(composition: Composition, stills: list[Still]) -> tuple[int, i
     """Return an even width and height [px] of a film: of view, caption and legend together."""
     low, high, _ = composition.room(stills)
     width, height = np.maximum((high - low) * LONGEST / (high - low).max(), SHORTEST)
-    letters = _type_scale(width, height)
-    legend = legend_picture(entries_of(composition, stills), round(width), letters)
-    below = letters * CAPTION + len(legend)
+    below = CAPTION + len(legend_picture(entries_of(composition, stills), round(width)))
     return 2 * round(width / 2), 2 * round((height + below) / 2)
-
-
-def _type_scale(width: float, height: float) -> float:
-    """Return the scale of type in a film of this width and height [px], 1 in a contact sheet."""
-    return float(np.clip(((width, height) / FULL_TYPE_SIDES).min(), SMALLEST_TYPE, 1.0))
 
 
 def _pictures(
@@ -127,15 +117,14 @@ def _pictures(
 ) -> Iterator[Array]:
     """Yield the picture (height, width, 3) of each still; repeated frames are drawn once."""
     width, height = size
-    letters = _type_scale(width, height)
-    legend = legend_picture(entries_of(composition, stills), width, letters)
-    room = height - round(letters * CAPTION) - len(legend)
+    legend = legend_picture(entries_of(composition, stills), width)
+    room = height - CAPTION - len(legend)
     if room < height / 4:
         raise InputError(f"--size {width}x{height}: too small for caption and legend")
     with Renderer(composition, stills, (width, room)) as renderer:
         for _, repeated in groupby(counted(stills, "pictures"), key=lambda still: still.index):
             still, *repeats = repeated
-            caption = caption_picture(still.caption, width, letters)
+            caption = caption_picture(still.caption, width)
             picture = np.concatenate([renderer.picture(still), caption, legend])
             yield from [picture] * (1 + len(repeats))
 

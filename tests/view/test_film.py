@@ -15,6 +15,7 @@ from surface_alone import drawable_of
 from msmpetsc.cli.commands import render as command
 from msmpetsc.cli.main import parsed
 from msmpetsc.errors import InputError
+from msmpetsc.view.annotations import CAPTION
 from msmpetsc.view.composition import Style
 from msmpetsc.view.film import playback_of, usual_speed, write_film
 
@@ -78,8 +79,7 @@ def test_a_film_fills_its_frame_and_says_its_speed(falling_ball, tmp_path, caplo
     with Image.open(tmp_path / "x.gif") as film:
         seconds = sum(picture.info["duration"] for picture in ImageSequence.Iterator(film)) / 1000
     assert 3 <= seconds <= 8 and "5 times slower than real" in caplog.text
-    # the part above the caption
-    pictures = np.array(pictures_of(tmp_path / "x.gif"))[:, :-68]
+    pictures = np.array(pictures_of(tmp_path / "x.gif"))[:, :-CAPTION]
     assert pictures.shape[1] > 1.5 * pictures.shape[2]
     body = (pictures[..., 2] - pictures[..., 0] > 15).any(axis=0)
     rows = np.flatnonzero(body.any(axis=1))
@@ -108,25 +108,15 @@ def test_the_ball_falls_and_leaps_in_the_film(falling_ball, tmp_path, ending, ca
     if ending == "mp4":
         pytest.importorskip("imageio_ffmpeg")
     path = tmp_path / "new" / f"x.{ending}"
-    render(
-        falling_ball,
-        "-o",
-        path,
-        "--size",
-        "320x480",
-        "--eye",
-        "0,-1,0",
-        "--speed",
-        0.5,
-        "--frames",
-        "0:11",
-    )
+    words = "--size 320x480 --eye 0,-1,0 --speed 0.5 --frames 0:11"
+    render(falling_ball, "-o", path, *words.split())
     assert capsys.readouterr().out.strip() == str(path)
     pictures = pictures_of(path)
     assert len(pictures) == len(HEIGHTS) and pictures[0].shape == (480, 320, 3)
     # the underside of the squashed ball is too dark to be blue
     whole = np.array(HEIGHTS) >= 0.1
-    rows = np.array([middle_of_body(picture) for picture in pictures])[whole]
+    # without the caption
+    rows = np.array([middle_of_body(picture[:-CAPTION]) for picture in pictures])[whole]
     centres = np.array(HEIGHTS)[whole]
     # pixels per metre, downwards
     scale = (rows[0] - rows[2]) / (centres[0] - centres[2])

@@ -21,12 +21,9 @@ from msmpetsc.results.reader import Result
 
 ENERGIES = ("kinetic", "elastic", "potential", "contact")
 COMPARED = ("position", "surface", *ENERGIES, "momentum")
-# strain of a body or a spring below which a difference counts as rounding [-]
-LEAST_STRAIN = 1e-6
-# distance within which points at rest count as the same, over the longest side [-]
-SAME_POINT = 1e-6
-# difference within which two times count as the same, over the frames' spacing [-]
-SAME_TIME = 1e-6
+# difference that counts as rounding [-]: a strain of a spring, a distance over the longest
+# side, a time over the frames' spacing
+ROUNDING = 1e-6
 SURFACE_FIELDS = ("frames/surface", "surface/points", "surface/triangles")
 # name of the field of root mean square distances
 MEAN = "surface, rms"
@@ -82,19 +79,15 @@ def compare(a: Result, b: Result) -> Comparison:
     refuse_different_lattices(a, b)
     either = [name for name in COMPARED if name in a.frames or name in b.frames]
     chosen = [name for name in either if name in a.frames and name in b.frames]
-    times = a.frames.time[:]
-    pairs = common_times(times, b.frames.time[:])
-    if not len(pairs):
-        raise InputError(f"{a.path} and {b.path} have no finished frame of the same time")
+    pairs = shared_frames(a, b)
     distances = {name: _distances(a, b, name, pairs) for name in chosen}
     scales = _scales(a, {name: size for name, (_, _, size) in distances.items()})
     fields = []
     for name, (greatest, worst, _) in distances.items():
         errors = np.where(greatest == 0, 0.0, greatest / scales[name])
         fields.append(FieldError(name, a.frames[name].unit, scales[name], errors, worst))
-    return Comparison(
-        pairs, times[pairs[:, 0]], fields, [name for name in either if name not in chosen]
-    )
+    times = a.frames.time[pairs[:, 0]]
+    return Comparison(pairs, times, fields, [name for name in either if name not in chosen])
 
 
 def rest_of(run: Result, name: str) -> Positions | None:
@@ -154,17 +147,17 @@ def _row_lengths(rows: Array) -> Floats:
 def _scales(a: Result, sizes: dict[str, float]) -> dict[str, float]:
     """Return the scale of each field, by which its errors are divided, from the fields' sizes."""
     side = longest_side(a.lattice.nodes[:], a.body_of("lattice"))
-    # energy [J] of the stiffest and longest spring at LEAST_STRAIN
+    # energy [J] of the stiffest and longest spring at ROUNDING
     least = 0.0
     if all(name in a.lattice and len(a.lattice[name]) for name in ("stiffness", "rest_length")):
         longest = a.lattice.rest_length[:].max()
-        least = float(0.5 * a.lattice.stiffness[:].max() * (LEAST_STRAIN * longest) ** 2)
+        least = float(0.5 * a.lattice.stiffness[:].max() * (ROUNDING * longest) ** 2)
     scales = dict(sizes)
     for name in sizes:
         if name in ENERGIES:
             scales[name] = max([least, *(sizes[of] for of in ENERGIES if of in sizes)])
         elif FRAME_FIELDS[name].at_rest:
-            scales[name] = max(sizes[name], LEAST_STRAIN * side)
+            scales[name] = max(sizes[name], ROUNDING * side)
     kinetic = max(least, sizes.get("kinetic", 0.0))
     if "momentum" in sizes and "mass" in a.lattice and kinetic > 0:
         scales["momentum"] = float(np.sqrt(2 * a.lattice.mass[:].sum() * kinetic))
@@ -197,7 +190,7 @@ def first_mismatch(a: Positions, b: Positions, kind: str) -> str:
     """Return in words how points (n, 3) [m] at rest first differ; "" if they are the same."""
     if len(a) != len(b):
         return f"{len(a)} and {len(b)} {kind}s"
-    same = rows_agree(a, b, SAME_POINT * longest_side(a, np.zeros(len(a), int)))
+    same = rows_agree(a, b, ROUNDING * longest_side(a, np.zeros(len(a), int)))
     if same.all():
         return ""
     first = int(np.argmin(same))
@@ -212,14 +205,21 @@ def point_text(point: Floats) -> str:
     return "(" + ", ".join(f"{x:.6g}" for x in point) + ") m"
 
 
-def common_times(a: Floats, b: Floats) -> Indices:
-    """Return the indices (p, 2) of times that two ascending series [s] share up to rounding."""
-    if not len(b):
-        return np.empty((0, 2), int)
-    tolerance = SAME_TIME * np.diff(b).min(initial=1.0)
-    near = np.searchsorted(b, a - tolerance).clip(max=len(b) - 1)
-    same = np.abs(b[near] - a) <= tolerance
-    return np.column_stack([np.nonzero(same)[0], near[same]])
+def shared_frames(a: Result, b: Result, start: float = -np.inf) -> Indices:
+    """Return the indices (p, 2) of frames after ``start`` [s] whose times agree up to rounding.
+
+    Raises InputError if there are none.
+    """
+    times, others = a.frames.time[:], b.frames.time[:]
+    pairs = np.empty((0, 2), int)
+    if len(others):
+        tolerance = ROUNDING * np.diff(others).min(initial=1.0)
+        near = np.searchsorted(others, times - tolerance).clip(max=len(others) - 1)
+        same = (np.abs(others[near] - times) <= tolerance) & (times > start)
+        pairs = np.column_stack([np.nonzero(same)[0], near[same]])
+    if not len(pairs):
+        raise InputError(f"{a.path} and {b.path} have no finished frame of the same time")
+    return pairs
 
 
 # values that overflow are reported as far apart
@@ -236,13 +236,9 @@ def compare_surfaces(run: Result, reference: Result) -> Comparison:
     refuse_different_meshes(run, reference)
     rest = reference["surface/points"][:]
     area = point_areas(rest, reference.indices("surface/triangles"))
-    times = run.frames.time[:]
-    pairs = common_times(times, reference.frames.time[:])
-    if reference.scene.get("time", {}).get("integrator") == "static":
-        # a static run starts at rest, which is no equilibrium
-        pairs = pairs[times[pairs[:, 0]] > 0]
-    if not len(pairs):
-        raise InputError(f"{run.path} and {reference.path} have no finished frame of the same time")
+    # a static run starts at rest, which is no equilibrium
+    is_static = reference.scene.get("time", {}).get("integrator") == "static"
+    pairs = shared_frames(run, reference, start=0.0 if is_static else -np.inf)
     worst = np.empty(len(pairs), int)
     greatest, rms = np.empty((2, len(pairs)))
     displacement = 0.0
@@ -255,13 +251,13 @@ def compare_surfaces(run: Result, reference: Result) -> Comparison:
         greatest[number] = distance[worst[number]]
         largest = np.nanmax(np.linalg.norm(true - rest, axis=1), initial=0.0)
         displacement = max(displacement, float(largest))
-    if displacement <= LEAST_STRAIN * longest_side(rest, reference.body_of("surface")):
+    if displacement <= ROUNDING * longest_side(rest, reference.body_of("surface")):
         # a smaller displacement is rounding
         displacement = 0.0
     scale = displacement or 1.0
     surface = FieldError("surface", "m", displacement, greatest / scale, worst)
     mean = FieldError(MEAN, "m", displacement, rms / scale, worst)
-    return Comparison(pairs, times[pairs[:, 0]], [surface, mean], [])
+    return Comparison(pairs, run.frames.time[pairs[:, 0]], [surface, mean], [])
 
 
 def point_areas(points: Positions, triangles: Indices) -> Array:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from msmpetsc.backend.arrays import Floats
 from msmpetsc.errors import InputError
-from msmpetsc.results.comparison import common_times, compare_surfaces, refuse_different_lattices
+from msmpetsc.results.comparison import compare_surfaces, refuse_different_lattices, shared_frames
 from msmpetsc.results.reader import Result
 from msmpetsc.study.table import Row
 
@@ -169,24 +169,19 @@ def trajectory_error(result: Path, reference: Path) -> float:
         sqrt( sum_times |x - x_ref|_M^2 / sum_times |x_ref - x_rest|_M^2 )
 
     The sums run over the times that both files have. x_ref stands for the limit of zero time step.
-    Rigid motion of the reference counts as motion. Raises InputError if the files have fewer than
-    two common times or different lattices, or if nothing moves.
+    Rigid motion of the reference counts as motion. Raises InputError if the files have different
+    lattices or no common time, or if nothing moves.
     """
     with Result(result) as run, Result(reference) as true:
         refuse_different_lattices(run, true)
         rest, mass = true["lattice/nodes"][:], true["lattice/mass"][:]
-        pairs = common_times(run.frames.time[:], true.frames.time[:])
-        if len(pairs) < 2:
-            raise InputError(
-                f"{result} and {reference} have {len(pairs)} times in common, 2 are needed"
-            )
         off = moved = 0.0
-        for of_run, of_reference in pairs:
+        for of_run, of_reference in shared_frames(run, true):
             x, x_ref = run.frames.position[of_run], true.frames.position[of_reference]
             off += mass @ ((x - x_ref) ** 2).sum(axis=1)
             moved += mass @ ((x_ref - rest) ** 2).sum(axis=1)
     if moved == 0:
-        raise InputError(f"{reference}: nothing moves in it")
+        raise InputError(f"{reference}: nothing moves in it at the times of {result}")
     return float(np.sqrt(off / moved))
 
 

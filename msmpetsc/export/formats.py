@@ -27,10 +27,7 @@ POINTS, TRIANGLES = 34962, 34963
 MOST_BYTES = 2**32 - 2**20
 # rotation by a quarter turn about x, as a quaternion (x, y, z, w)
 Z_UP_TO_Y_UP = [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]
-CLAY = {
-    "pbrMetallicRoughness": {"baseColorFactor": [0.8, 0.55, 0.4, 1.0], "metallicFactor": 0.0},
-    "doubleSided": True,
-}
+CLAY = [0.8, 0.55, 0.4]
 
 
 def normals(points: Array, triangles: Indices) -> Array:
@@ -88,10 +85,7 @@ class Chunk:
 
     def add_shape(self, points: Array, normals: Array) -> dict[str, int]:
         """Add points and normals, (v, 3) float32 each; return their accessors."""
-        return {
-            "POSITION": self.add(points, POINTS),
-            "NORMAL": self.add(normals, POINTS),
-        }
+        return {"POSITION": self.add(points, POINTS), "NORMAL": self.add(normals, POINTS)}
 
 
 def write_glb(run: Result, frames: Sequence[int], path: Path) -> None:
@@ -141,6 +135,7 @@ def _document(
     x, y, z = middle.tolist()
     primitive: dict[str, Any] = {"attributes": shape, "indices": indices, "material": 0}
     mesh: dict[str, Any] = {"primitives": [primitive], "name": name}
+    colour = {"baseColorFactor": [*CLAY, 1.0], "metallicFactor": 0.0}
     if targets:
         primitive["targets"] = targets
         mesh["weights"] = [0.0] * len(targets)
@@ -150,7 +145,7 @@ def _document(
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "translation": [x, z, -y], "rotation": Z_UP_TO_Y_UP, "name": name}],
         "meshes": [mesh],
-        "materials": [CLAY],
+        "materials": [{"pbrMetallicRoughness": colour, "doubleSided": True}],
     }
 
 
@@ -158,11 +153,8 @@ def _animation(chunk: Chunk, times: Floats, targets: int) -> dict[str, Any]:
     """Return the animation that shows each frame at its time (t,) [s], linear between frames."""
     since = (times - times[0]).astype(np.float32)
     weights = np.eye(targets + 1, targets, -1, np.float32).ravel()
-    sampler = {
-        "input": chunk.add(since),
-        "output": chunk.add(weights),
-        "interpolation": "LINEAR",
-    }
+    ends = {"input": chunk.add(since), "output": chunk.add(weights)}
+    sampler = ends | {"interpolation": "LINEAR"}
     channel = {"sampler": 0, "target": {"node": 0, "path": "weights"}}
     return {"samplers": [sampler], "channels": [channel]}
 

@@ -13,10 +13,9 @@ from pxr import Gf, Tf, Usd, UsdGeom, Vt
 
 from msmpetsc.backend.arrays import Array, Floats, Indices
 from msmpetsc.errors import one_line
-from msmpetsc.export.formats import middle_of, normals
+from msmpetsc.export.formats import CLAY, middle_of, normals
 from msmpetsc.results.reader import Result
 
-CLAY = (0.8, 0.55, 0.4)
 # USD's tokens of the axes that may be upward
 UP = {1: UsdGeom.Tokens.y, 2: UsdGeom.Tokens.z}
 # frames between saves of a binary file [-]; bounds the memory

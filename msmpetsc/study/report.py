@@ -19,15 +19,7 @@ from msmpetsc.study.charts.plot import Chart, curve_styles, save_png, svg_text
 from msmpetsc.study.charts.profile import profile_charts
 from msmpetsc.study.charts.stability import stability_charts
 from msmpetsc.study.outcomes import counted
-from msmpetsc.study.table import (
-    NUMBERS,
-    TEXT,
-    failed,
-    mapped,
-    read_table,
-    succeeded,
-    swept,
-)
+from msmpetsc.study.table import NUMBERS, TEXT, failed, mapped, read_table, succeeded, swept
 
 # leading columns of the table of all cases
 FIRST = ["scene", "label", "status"]

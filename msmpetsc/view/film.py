@@ -29,8 +29,6 @@ MAX_FPS = 30.0
 # range of a film's default length, and greatest length [s]
 LENGTHS = (3.0, 8.0)
 LONGEST_FILM = 3600.0
-# a default speed is one of these factors times a power of ten
-STEPS = (1, 2, 5)
 
 
 @dataclass(frozen=True)
@@ -60,7 +58,7 @@ def usual_speed(span: float) -> float:
     """Return a round speed [simulated s/s] at which a film of a time span [s] lasts 3 to 8 s."""
     if not 0 < span < np.inf:
         return 1.0
-    factors = np.outer(10.0 ** np.arange(20), STEPS).ravel()
+    factors = np.outer(10.0 ** np.arange(20), (1, 2, 5)).ravel()
     least, most = LENGTHS
     if span < least:
         return float(1 / factors[np.argmax(span * factors >= least)])

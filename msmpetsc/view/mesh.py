@@ -21,8 +21,6 @@ from msmpetsc.view.drawable import BodiesAtRest, Drawable
 
 # angle between normals above which an edge is sharp [degrees]
 SHARP = 30.0
-# share of fixed nodes from which a surface point has the colour of fixed parts [-]
-FIXED_SHARE = 0.5
 # approximate limit of triangles after refinement
 MAX_TRIANGLES = 30_000
 # corners of a cell in VTK's order
@@ -143,16 +141,10 @@ def split_at_edges(points: Positions, triangles: Indices) -> tuple[Indices, Indi
     return split["pyvistaOriginalPointIds"], split.regular_faces
 
 
-# values of lattice/cell_kind
-BOUNDARY, INTERIOR = 1, 2
-# size of a drawn cell over its true size [-]; leaves gaps between cells
-CELL_SCALE = 0.86
-# opacity of a body whose cells are shown
-CUT_OPACITY = 0.3
 # cells (c, 8) of the remaining half, by their kind
 Cut = dict[int, Indices]
-# colour and legend of each kind
-KINDS = {BOUNDARY: (BOUNDARY_CELL, "boundary cell"), INTERIOR: (INTERIOR_CELL, "interior cell")}
+# colour and legend of each value of lattice/cell_kind
+KINDS = {1: (BOUNDARY_CELL, "boundary cell"), 2: (INTERIOR_CELL, "interior cell")}
 
 
 def cut_open(subject: Drawable, camera: Camera) -> Cut:

@@ -22,8 +22,6 @@ CUT = 1.3
 MARGIN = 0.08
 # radius of a ground
 GROUND = 1.6
-# thickness of a glass plate
-THICKNESS = 0.02
 
 
 @dataclass(frozen=True)
@@ -113,13 +111,8 @@ def overlays_at(subject: Drawable, index: int, bodies: Positions, camera: Camera
             seen = _box(np.array([center - radius, center + radius]), bodies)
             shown.balls.extend(Ball(center, radius, corners) for corners in seen)
         elif obstacle.shape == "plane":
-            _add_plane(
-                shown,
-                np.array(obstacle.point) + pose[:3],
-                np.array(obstacle.normal),
-                bodies,
-                camera,
-            )
+            point, normal = np.array(obstacle.point) + pose[:3], np.array(obstacle.normal)
+            _add_plane(shown, point, normal, bodies, camera)
         elif number in solids and len(solids[number].points):
             origin, *axes = path.moved(np.concatenate([np.zeros((1, 3)), np.eye(3)]), pose)
             corners = (
@@ -149,7 +142,8 @@ def _add_plane(
         margin = MARGIN * extent
         plate = np.array([across.min(axis=0) - margin, across.max(axis=0) + margin])
         front = np.array([*product(*plate.T)]) @ sides + (point @ normal) * normal
-        shown.glass.append(np.concatenate([front, front - THICKNESS * extent * normal]))
+        thickness = 0.02 * extent
+        shown.glass.append(np.concatenate([front, front - thickness * normal]))
 
 
 def _sides(normal: Floats) -> Rows:

@@ -31,8 +31,8 @@ from msmpetsc.view.mesh import drawn
 
 # largest size of all frames before packing [byte]; frames beyond it are left out
 MAX_BYTES = 30_000_000
-# largest 16-bit integer
-LEVELS = 65535
+# largest integer of a position
+LEVELS: int = np.iinfo(np.uint16).max
 PARTS = files("msmpetsc.view")
 SCRIPTS = ("page.js", "page_drawing.js", "page_steering.js")
 

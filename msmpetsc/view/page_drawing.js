@@ -20,7 +20,7 @@ precision mediump float;
 in vec3 facing; in vec3 paint; in float held; uniform vec3 fixedColour; out vec4 pixel;
 ${LIGHT}
 void main() {
-  vec3 colour = held > 0.5 ? fixedColour : paint; // FIXED_SHARE of mesh.py
+  vec3 colour = held > 0.5 ? fixedColour : paint; // as renderer.py
   pixel = vec4(colour * light(normalize(facing)), 1.0);
 }`];
 const FLAT = [`#version 300 es

@@ -13,10 +13,11 @@ from msmpetsc.backend.arrays import Array, Floats
 from msmpetsc.errors import InputError
 from msmpetsc.view.colours import ARROW, FIXED, GLASS, GLASS_EDGE, GROUND, SHADOW
 from msmpetsc.view.composition import Composition, Still
-from msmpetsc.view.mesh import CELL_SCALE, CUT_OPACITY, FIXED_SHARE, KINDS, surface_of
+from msmpetsc.view.mesh import KINDS, surface_of
 from msmpetsc.view.overlays import Ground, Overlays
 
 GLASS_OPACITY = 0.22
+SHADING: dict[str, Any] = dict(smooth_shading=True, ambient=0.42, diffuse=0.62)
 # share of a ground's radius from which it fades, and number of corners of its rim
 FADING, RIM_CORNERS = 0.55, 72
 
@@ -82,22 +83,19 @@ class Renderer(AbstractContextManager["Renderer"]):
         surface["fixed"] = subject.fixed(still.index)
         for ground in still.overlays.grounds:
             _draw_ground(self._plotter, ground, surface)
-        shading: dict[str, Any] = dict(
-            smooth_shading=True, ambient=0.42, diffuse=0.62, specular=0.08
-        )
-        shading["opacity"] = CUT_OPACITY if still.cut else 1.0
+        shading = SHADING | dict(specular=0.08, opacity=0.3 if still.cut else 1.0)
         # clipping PolyData would merge the points along sharp edges
-        free, fixed = surface.cast_to_unstructured_grid().clip_scalar(
-            scalars="fixed", value=FIXED_SHARE, both=True
-        )
+        whole = surface.cast_to_unstructured_grid()
+        # a point looks fixed if half of its nodes are
+        free, fixed = whole.clip_scalar(scalars="fixed", value=0.5, both=True)
         for part, paint in (free, dict(scalars="colours", rgb=True)), (fixed, dict(color=FIXED)):
             if part.n_cells:
                 self._plotter.add_mesh(part, **paint, **shading)
         for kind, cells in (still.cut or {}).items():
-            grid = pv.UnstructuredGrid(
-                {pv.CellType.HEXAHEDRON: cells}, subject.nodes(still.index)
-            ).shrink(CELL_SCALE)
-            self._plotter.add_mesh(grid, color=KINDS[kind][0], ambient=0.5, diffuse=0.55)
+            nodes = subject.nodes(still.index)
+            grid = pv.UnstructuredGrid({pv.CellType.HEXAHEDRON: cells}, nodes)
+            color = KINDS[kind][0]
+            self._plotter.add_mesh(grid.shrink(0.86), color=color, ambient=0.5, diffuse=0.55)
         self._draw_obstacles(still.overlays)
         # moved towards the eye, an arrow stays in place and nothing hides it
         towards_eye = 2 * self._depth * self._composition.camera.to_eye
@@ -116,32 +114,22 @@ class Renderer(AbstractContextManager["Renderer"]):
             )
         for ball in overlays.balls:
             sphere = pv.Sphere(
-                radius=ball.radius,
-                center=ball.center.tolist(),
-                theta_resolution=96,
-                phi_resolution=96,
+                radius=ball.radius, center=ball.center, theta_resolution=96, phi_resolution=96
             )
-            shading: dict[str, Any] = dict(smooth_shading=True, ambient=0.6, diffuse=0.4)
+            shading = dict(smooth_shading=True, ambient=0.6, diffuse=0.4)
             self._plotter.add_mesh(sphere, color=GLASS, opacity=GLASS_OPACITY, **shading)
         for obstacle in overlays.meshes:
             solid = self._composition.subject.solids[obstacle.number]
             mesh = surface_of(obstacle.moved(solid.points), solid.triangles)
-            shading = dict(smooth_shading=True, split_sharp_edges=True, ambient=0.42, diffuse=0.62)
-            self._plotter.add_mesh(mesh, color=GLASS, **shading)
+            self._plotter.add_mesh(mesh, color=GLASS, split_sharp_edges=True, **SHADING)
 
 
 def _draw_ground(plotter: pv.Plotter, ground: Ground, body: pv.PolyData) -> None:
     """Draw a disk that fades towards its rim, and the body's shadow on it."""
     middle = ground.corners.mean(axis=0)
     radius = float(np.linalg.norm(ground.corners[1] - ground.corners[0])) / 2
-    disk = pv.Disc(
-        center=middle,
-        inner=0,
-        outer=radius,
-        normal=ground.normal.tolist(),
-        r_res=20,
-        c_res=RIM_CORNERS,
-    )
+    normal = ground.normal.tolist()
+    disk = pv.Disc(center=middle, inner=0, outer=radius, normal=normal, r_res=20, c_res=RIM_CORNERS)
     share = np.linalg.norm(disk.points - middle, axis=1) / radius
     share = np.clip((1 - share) / (1 - FADING), 0, 1)
     opacity = 255 * share**2 * (3 - 2 * share)

@@ -13,14 +13,7 @@ from msmpetsc.scene.toml import overrides_of
 from msmpetsc.study.cases import Case
 from msmpetsc.study.metrics import surface_error
 from msmpetsc.study.runner import Bench
-from msmpetsc.study.sizing.choice import (
-    Budget,
-    Choice,
-    PlannedMethod,
-    SizePlan,
-    SizeTrial,
-    tables,
-)
+from msmpetsc.study.sizing.choice import Budget, Choice, PlannedMethod, SizePlan, SizeTrial, tables
 from msmpetsc.study.sizing.orders import ORDERS, ErrorLaw, cosine_of, error_law
 
 # ratio of cell edges between successive lattices, and of the scene's lattice to the

@@ -21,8 +21,8 @@ from msmpetsc.results.reader import Result
 
 ENERGIES = ("kinetic", "elastic", "potential", "contact")
 COMPARED = ("position", "surface", *ENERGIES, "momentum")
-# difference that counts as rounding [-]: a strain of a spring, a distance over the longest
-# side, a time over the frames' spacing
+# difference that counts as rounding [-]: a strain of a spring, a distance over the
+# longest side, a time over the frames' spacing
 ROUNDING = 1e-6
 SURFACE_FIELDS = ("frames/surface", "surface/points", "surface/triangles")
 # name of the field of root mean square distances

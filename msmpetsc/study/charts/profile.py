@@ -25,8 +25,6 @@ PROBLEM = ["scene", "time_step", "error", "cells"]
 FEWEST = 3
 # title of a panel by its column
 COSTS = {"time_frame": "seconds", "products": "products with the Hessian"}
-# longest axis [-]
-FARTHEST = 100.0
 
 
 def profile_charts(table: DataFrame, styles: Styles) -> list[Chart]:
@@ -92,13 +90,13 @@ def profile_chart(name: str, problems: list[DataFrame], styles: Styles) -> Chart
 def draw_profile(chart: Chart, title: str, factors: DataFrame) -> None:
     """Draw the share of problems over the factor as a step function for each method."""
     known = factors.to_numpy(float)
-    right = min(max(1.1 * float(known[np.isfinite(known)].max()), 2.0), FARTHEST)
+    right = max(1.1 * float(known[np.isfinite(known)].max()), 2.0)
     x = channel("factor", "format(datum.value, '~g')", type="log", domain=[1, right])
     y = channel("problems", "format(datum.value, '.0%')", domain=[0, 1])
     panel = chart.panel(f"by {title}", x, y)
     values = []
     for label, column in zip(factors, known.T, strict=True):
-        for end in np.unique([1.0, *column[column <= right], right]).tolist():
+        for end in np.unique([1.0, *column[np.isfinite(column)], right]).tolist():
             share = float((column <= end).mean())
             tip = f"{label}\n{share:.0%} within {end:.3g}"
             values.append({"x": end, "y": share, "curve": label, "tip": tip})

@@ -135,9 +135,8 @@ def digest(file: Path, scene: Scene) -> str:
     """Return the digest of a scene file and of the files that it names."""
     names = sorted({name for _, name in scene.named_files()})
     paths = [file, *(file.parent / name for name in names)]
-    return hashlib.sha256(
-        b"\0".join(path.read_bytes() for path in paths if path.is_file())
-    ).hexdigest()[:16]
+    contents = b"\0".join(path.read_bytes() for path in paths if path.is_file())
+    return hashlib.sha256(contents).hexdigest()[:16]
 
 
 def with_tables(
@@ -192,11 +191,9 @@ def with_laws(scene: StudyScene, sweep: Sweep) -> Iterator[tuple[StudyScene, Swe
     if not sweep.laws:
         yield scene, sweep
     for law in sweep.laws:
+        label = ", ".join(filter(None, (sweep.label, law)))
         changed = scene.model_copy(update={"set": (*scene.set, f"material.law={law}")})
-        yield (
-            changed,
-            sweep.model_copy(update={"label": ", ".join(filter(None, (sweep.label, law)))}),
-        )
+        yield changed, sweep.model_copy(update={"label": label})
 
 
 def sweep_cases(study: Study, scene: StudyScene, sweep: Sweep, folder: Path) -> Iterator[Case]:
@@ -241,9 +238,8 @@ def _methods(base: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> It
 def _label(sweep: Sweep, case: Case) -> str:
     integrator = case.integrator.removeprefix("implicit-euler")
     name = sweep.label or " ".join(filter(None, (integrator, case.preset, case.options)))
-    return (
-        name if case.ranks == 1 or sweep.ranks == (case.ranks,) else f"{name}, {case.ranks} ranks"
-    )
+    vary = case.ranks != 1 and len(sweep.ranks) > 1
+    return f"{name}, {case.ranks} ranks" if vary else name
 
 
 def _timed(case: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Case:
@@ -337,17 +333,8 @@ def map_points(map: Map) -> Iterator[tuple[float | None, float | str, MapCase]]:
     if map.x and map.y and map.file:
         for y, x in product(map.y.values, map.x.values):
             changes = (*map.set, *axis_changes(map.x, x, map), *axis_changes(map.y, y, map))
-            yield (
-                x,
-                y,
-                MapCase(
-                    name=map.name,
-                    file=map.file,
-                    steps=map.steps,
-                    duration=map.duration,
-                    set=changes,
-                ),
-            )
+            length = {"steps": map.steps, "duration": map.duration}
+            yield x, y, MapCase(name=map.name, file=map.file, set=changes, **length)
 
 
 def axis_changes(axis: Axis, value: float, length: Length) -> Iterator[str]:

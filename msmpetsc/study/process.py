@@ -55,11 +55,8 @@ class Processes:
         status: int | None = None
         try:
             status = process.wait(timeout)
-            reason = (
-                ""
-                if status == 0
-                else last_error(log.read_text(errors="replace")) or f"exit status {status}"
-            )
+            said = last_error(log.read_text(errors="replace")) if status else ""
+            reason = (said or f"exit status {status}") if status else ""
         except subprocess.TimeoutExpired:
             reason = too_long(timeout)
         finally:
@@ -82,13 +79,9 @@ class Processes:
             if self.stopped:
                 return None
             process = subprocess.Popen(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=out,
-                stderr=out,
+                command, stdin=subprocess.DEVNULL, stdout=out, stderr=out, env=variables,
                 start_new_session=True,
-                env=variables,
-            )
+            )  # fmt: skip
             self._running.add(process)
             return process
 

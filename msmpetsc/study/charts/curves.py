@@ -182,15 +182,9 @@ GROWTH_CAPTION = (
 # columns that distinguish the curves of a method, if they vary
 VARIED = ("error", "max_iterations", "ranks")
 GROWTH_TIP = (
-    "time_frame",
-    "memory",
-    "iterations",
-    "ksp_its",
-    "true_error",
-    "time_setup",
-    "time_factor",
+    "time_frame", "memory", "iterations", "ksp_its", "true_error", "time_setup", "time_factor",
     "ranks",
-)
+)  # fmt: skip
 # title, column, format of ticks, whether the column has a range over the repeats
 GROWTH_PANELS = (
     ("frames a second", "fps", COUNT, True),
@@ -203,17 +197,13 @@ GROWTH_PANELS = (
 def growth_charts(table: DataFrame) -> list[Chart]:
     """Return a chart for each scene and time step if a curve has at least two cell counts."""
     charts = []
-    for (scene, time_step), rows in grouped(
-        measured(succeeded(table), "cells"), "scene", "time_step"
-    ).items():
-        rows = with_curves(rows)
-        if rows.groupby("label")["cells"].nunique().max() > 1:
+    rows = measured(succeeded(table), "cells")
+    for (scene, time_step), group in grouped(rows, "scene", "time_step").items():
+        curves = with_curves(group)
+        if curves.groupby("label")["cells"].nunique().max() > 1:
             step = f", time step {formatting.seconds(time_step)}" if time_step > 0 else ""
-            charts.append(
-                growth_chart(
-                    f"growth_{scene}_{formatting.plain(time_step)}", f"{scene}{step}", rows
-                )
-            )
+            name = f"growth_{scene}_{formatting.plain(time_step)}"
+            charts.append(growth_chart(name, f"{scene}{step}", curves))
     return [chart for chart in charts if chart.panels]
 
 

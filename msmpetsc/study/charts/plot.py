@@ -32,10 +32,6 @@ SHAPES = ("circle", "square", "triangle-up", "diamond", "triangle-down", "cross"
 RING = "M1,0A1,1,0,1,1,-1,0A1,1,0,1,1,1,0M.86,0A.86,.86,0,1,0,-.86,0A.86,.86,0,1,0,.86,0"
 # width of a chart and height of a panel [px]
 WIDTH, HEIGHT = 1080, 280
-# area of a marker [px^2]
-MARKER = 50
-# mean width of a legend's letter [px]
-LETTER = 8
 CONFIG: dict[str, Any] = {
     "background": "white",
     "font": "DejaVu Sans, Verdana, Arial, sans-serif",
@@ -146,7 +142,7 @@ class Axes:
 
     def mark(self, values: list[dict[str, Any]]) -> None:
         """Draw a marker with a tooltip for each value from ``points``."""
-        mark = {"type": "point", "size": MARKER, "stroke": "white", "strokeWidth": 0.6}
+        mark = {"type": "point", "size": 50, "stroke": "white", "strokeWidth": 0.6}
         shape, color = nominal(self.styles, "shape"), nominal(self.styles, "color")
         self.draw(values, mark, shape=shape, fill=color, description={"field": "tip"})
 
@@ -212,18 +208,13 @@ class Chart:
 
 def legend(styles: Styles) -> dict[str, Any]:
     """Return a chart that shows only the legend."""
-    longest = max(map(len, styles), default=1)
-    shown = {"title": None, "columns": max(1, int(WIDTH / (LETTER * longest + 40)))}
+    # a letter is about 8 pixels wide
+    longest = 8 * max(map(len, styles), default=1)
+    shown = {"title": None, "columns": max(1, WIDTH // (longest + 40))}
     channels = {"fill": nominal(styles, "color", shown), "shape": nominal(styles, "shape", shown)}
-    values = [{"curve": name} for name in styles]
+    values = {"values": [{"curve": name} for name in styles]}
     mark = {"type": "point", "opacity": 0, "aria": False}
-    return {
-        "width": WIDTH,
-        "height": 1,
-        "data": {"values": values},
-        "mark": mark,
-        "encoding": channels,
-    }
+    return {"width": WIDTH, "height": 1, "data": values, "mark": mark, "encoding": channels}
 
 
 def nominal(styles: Styles, name: str, legend: dict[str, Any] | None = None) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from msmpetsc.study import runner
 from msmpetsc.study.cases import Case, command, study_cases
 from msmpetsc.study.runner import run_study
 from msmpetsc.study.study_file import load_study
-from msmpetsc.study.table import NUMBERS, TEXT, read_table, records
+from msmpetsc.study.table import COLUMNS, read_table, records
 
 STAND_IN = ROOT / "tests" / "helpers" / "study_stand_in.py"
 
@@ -69,8 +69,7 @@ def calls(folder: Path) -> list[str]:
 
 
 def all_cases(folder: Path, text: str, full: bool = False) -> list[Case]:
-    path = study_file(folder, text)
-    return study_cases(load_study(path), folder, full)
+    return study_cases(load_study(study_file(folder, text)), folder, full)
 
 
 def alive(pid: int) -> bool:
@@ -86,26 +85,18 @@ VOID = {"meta", "br"}
 
 def row_of(label: str, **given) -> dict[str, str]:
     """Return a row of the table as text; some columns follow from the time of a frame."""
-    row = {
-        "label": label,
-        "preset": label,
-        "scene": "block",
-        "integrator": "implicit-euler",
-        "status": "ok",
-    }
-    row |= {"study": "try", "time_step": 0.01, "cells": 1000, "ranks": 1} | given
+    row = {"label": label, "preset": label, "scene": "block", "status": "ok", "study": "try"}
+    row |= {"time_step": 0.01, "cells": 1000, "ranks": 1} | given
     if row.get("time_frame"):
         row |= {"fps": 1 / row["time_frame"], "time_second": row["time_frame"] / row["time_step"]}
-    row.setdefault(
-        "command",
-        "msmpetsc run " + " ".join(f"--set {name}={value}" for name, value in given.items()),
-    )
+    changes = " ".join(f"--set {name}={value}" for name, value in given.items())
+    row |= {"command": f"msmpetsc run {changes}"}
     return {name: str(value) for name, value in row.items()}
 
 
 def write_rows(folder: Path, rows: list[dict[str, str]]) -> Path:
     with (folder / "table.csv").open("w", newline="") as stream:
-        table = csv.DictWriter(stream, TEXT + NUMBERS, extrasaction="ignore")
+        table = csv.DictWriter(stream, COLUMNS, extrasaction="ignore")
         table.writeheader()
         table.writerows(rows)
     return folder
@@ -121,9 +112,8 @@ def svgs(text: str) -> list[ElementTree.Element]:
 
 
 def tooltips(text: str) -> list[str]:
-    return [
-        title.text for svg in svgs(text) for title in svg.iter("{http://www.w3.org/2000/svg}title")
-    ]
+    name = "{http://www.w3.org/2000/svg}title"
+    return [title.text for svg in svgs(text) for title in svg.iter(name)]
 
 
 class Balance(HTMLParser):

@@ -50,22 +50,13 @@ def main() -> None:
     words = sys.argv[1:]
     out, measure = (Path(words[words.index(name) + 1]) for name in ("-o", "--measure"))
     changes = [words[n + 1].partition("=") for n, word in enumerate(words) if word == "--set"]
-    tables = {
-        key: tomllib.loads(f"v = {value}")["v"]
-        for key, _, value in changes
-        if value.startswith("{")
-    }
+    values = {key: value for key, _, value in changes}
+    time, every = tomllib.loads(f"v = {values['time']}")["v"], int(values.get("output.every", 1))
     comm = MPI.COMM_WORLD
     count = len((out.parent.parent / CALLS).read_text().splitlines()) if comm.rank == 0 else 0
     if "-ksp_fail" in words:
         sys.exit("a note\nmsmpetsc: error: planted, with reason\nafterwards")
-    write(
-        comm,
-        out,
-        tables["time"],
-        int(dict((k, v) for k, _, v in changes).get("output.every", 1)),
-        count,
-    )
+    write(comm, out, time, every, count)
     if comm.rank == 0:
         kind = words[words.index("-ksp_kind") + 1] if "-ksp_kind" in words else None
         failure = {"failure": kind and {"kind": kind, "frame": 3, "says": "planted"}}
@@ -85,35 +76,22 @@ def write(comm, out: Path, table: dict, every: int, count: int) -> None:
         for index in range(count_of_frames):
             time = index * step * every
             x = NODES + (1 + step) * time * np.array([0, 0, 1.0])
-            solved = dict(
-                step_error=0.01,
-                iterations=3 * every,
-                ksp_its=30 * every,
-                wall_time=every * step * count,
-            )
-            file.append(blank_frame(index=index, time=time, position=x[own], **solved))
+            solved = dict(step_error=0.01, iterations=3 * every, ksp_its=30 * every)
+            place = dict(index=index, time=time, position=x[own])
+            file.append(blank_frame(wall_time=every * step * count, **place, **solved))
 
 
 def blank_frame(**given) -> Frame:
     """Return a frame of zeros with the given values."""
-    blank = {field.name: 0.0 for field in fields(Frame) if field.default is MISSING} | {
-        "surface": None,
-        "momentum": np.zeros(3),
-    }
-    return Frame(**blank | given)
+    blank = {field.name: 0.0 for field in fields(Frame) if field.default is MISSING}
+    return Frame(**blank | {"surface": None, "momentum": np.zeros(3)} | given)
 
 
 def told(ranks: int, count: int) -> dict:
     times = dict.fromkeys(("setup", "factor", "local", "ksp", "output", "stepping"), float(count))
     machine = {"cpu": "a CPU", "cores": 2, "memory": 2**33, "system": "Linux"}
-    counts = {
-        "cells": 1,
-        "nodes": 8,
-        "unknowns": 8,
-        "springs": 28,
-        "ranks": ranks,
-        "memory": 1000 - count,
-    }
+    counts = {"cells": 1, "nodes": 8, "unknowns": 8, "springs": 28, "ranks": ranks}
+    counts |= {"memory": 1000 - count}
     return {"machine": machine, "versions": {"msmpetsc": "x"}, "time": times, **counts}
 
 

@@ -23,54 +23,31 @@ from msmpetsc.study.charts.profile import comparable, profile_charts, ratios
 from msmpetsc.study.report import write_report
 from msmpetsc.study.table import as_table, read_table
 
+# label, error asked for, seconds of a frame, true error of a step, error of the motion
+MEASURED = (
+    ("newton", 1e-2, 0.05, 4e-3, 0.2), ("newton", 1e-4, 0.08, 3e-5, 0.1),
+    ("anderson", 1e-2, 0.03, 6e-3, 0.21), ("anderson", 1e-4, 0.11, 7e-5, 0.11),
+)  # fmt: skip
 ERRORS = [
-    row_of(
-        "newton", case="newton", error=1e-2, time_frame=0.05, true_error=4e-3, trajectory_error=0.2
+    *(
+        row_of(label, error=error, time_frame=time, true_error=true, trajectory_error=motion)
+        for label, error, time, true, motion in MEASURED
     ),
-    row_of("newton", error=1e-4, time_frame=0.08, true_error=3e-5, trajectory_error=0.1),
+    row_of("verlet", preset="", time_frame=0.02, trajectory_error=4e-4, substep=0.001),
     row_of(
-        "anderson",
-        case="anderson",
-        error=1e-2,
-        time_frame=0.03,
-        true_error=6e-3,
-        trajectory_error=0.21,
-    ),
-    row_of("anderson", error=1e-4, time_frame=0.11, true_error=7e-5, trajectory_error=0.11),
-    row_of(
-        "verlet",
-        integrator="verlet",
-        preset="",
-        time_frame=0.02,
-        trajectory_error=4e-4,
-        substep=0.001,
-    ),
-    row_of(
-        "paper",
-        status="failed",
-        reason="frame 3 did not converge",
-        error=1e-4,
-        time_frame=1e-3,
+        "paper", status="failed", reason="frame 3 did not converge", error=1e-4, time_frame=1e-3,
         true_error=1e-7,
     ),
-]
+]  # fmt: skip
 SWEEP = [
     row_of(
-        label,
-        scene="bunny",
-        cells=n,
-        time_frame=time,
-        preset=preset,
-        true_error=5e-4,
-        ksp_its=its,
-        memory=1e6 * n,
+        label, scene="bunny", cells=n, time_frame=time, true_error=5e-4, ksp_its=its, memory=1e6 * n
     )
-    for label, preset, times, its in (
-        ("cholesky", "fast-msm", (0.01, 0.1, 2.0), 10),
-        ("cg", "anderson", (0.02, 0.09, 0.5), 40),
+    for label, times, its in (
+        ("cholesky", (0.01, 0.1, 2.0), 10), ("cg", (0.02, 0.09, 0.5), 40),
     )
     for n, time in zip((1000, 10000, 100000), times, strict=True)
-]
+]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -100,9 +77,8 @@ def test_the_front_is_what_nothing_beats(points: list[tuple[float, float]]):
 
     found = front([x for x, _ in points], [y for _, y in points])
     assert set(found) == {index for index, point in enumerate(points) if not beaten(point)}
-    assert len(set(found)) == len(found) and [points[i][0] for i in found] == sorted(
-        points[i][0] for i in found
-    )
+    errors = [points[i][0] for i in found]
+    assert len(set(found)) == len(found) and errors == sorted(errors)
 
 
 def test_errors_that_read_alike_are_no_reason_to_pay_more():
@@ -113,9 +89,8 @@ def test_errors_that_read_alike_are_no_reason_to_pay_more():
 
 
 def repeated(label: str, low: float, time: float, high: float, **given) -> dict[str, str]:
-    return row_of(
-        label, repeats=3, time_frame=time, time_frame_min=low, time_frame_max=high, **given
-    )
+    times = {"time_frame": time, "time_frame_min": low, "time_frame_max": high}
+    return row_of(label, repeats=3, **times, **given)
 
 
 NOISY = [
@@ -132,17 +107,16 @@ def test_twenty_options_are_told_apart_by_colour_and_mark():
     drawn = list(styles.values())
     triangles = {"triangle-up", "triangle-down", "triangle-left", "triangle-right"}
     for one, other in zip(drawn, drawn[11:], strict=False):
-        assert (
-            one.color == other.color
-            and one.shape != other.shape
-            and not {one.shape, other.shape} <= triangles
-        )
+        assert one.color == other.color and one.shape != other.shape
+        assert not {one.shape, other.shape} <= triangles
     rows = as_table([
         row_of(label, cells=cells, error=error, time_frame=1, true_error=error)
         for label in styles for error in (1e-1, 1e-2, 1e-3, 1e-4) for cells in (1000, 2000)
     ])  # fmt: skip
     (chart,) = growth_charts(rows)
     assert len(set(chart.styles.values())) == 80
+    # curves of one label are told apart by what varies
+    assert list(chart.styles)[1] == "option 0, error 1e-2 (step error 1e-2)"
 
 
 def values(panel: Axes, column: str) -> list:
@@ -159,15 +133,10 @@ def curves_in(chart: Chart) -> dict[str, set[str]]:
 
 
 def test_whiskers_reach_from_the_least_to_the_greatest_of_the_repeats():
-    rows = as_table(
-        [
-            *NOISY,
-            *(
-                repeated("cg", t / 2, t, 3 * t, cells=n, scene="s")
-                for n, t in ((10, 0.1), (99, 1.0))
-            ),
-        ]
-    )
+    growing = [
+        repeated("cg", t / 2, t, 3 * t, cells=n, scene="s") for n, t in ((10, 0.1), (99, 1.0))
+    ]
+    rows = as_table([*NOISY, *growing])
     (pareto,), (growth,) = pareto_charts(rows, curve_styles(rows["label"])), growth_charts(rows)
 
     def ends(panel: Axes) -> list:
@@ -177,9 +146,8 @@ def test_whiskers_reach_from_the_least_to_the_greatest_of_the_repeats():
     assert step == [(0.009, 0.021), (0.009, 0.022), (0.014, 0.037), (0.02, 0.037), (0.022, 0.031)]
     assert trajectory[0] == pytest.approx((0.9, 2.1))
     speed, cost = map(ends, growth.panels)
-    assert np.allclose(speed, [(1 / 3, 2), (1 / 0.3, 20)]) and np.allclose(
-        cost, [(0.005, 0.03), (0.5 / 99, 3 / 99)]
-    )
+    assert np.allclose(speed, [(1 / 3, 2), (1 / 0.3, 20)])
+    assert np.allclose(cost, [(0.005, 0.03), (0.5 / 99, 3 / 99)])
     for panel in (*pareto.panels, *growth.panels):
         low, high = panel.y["scale"]["domain"]
         assert all(low <= a <= b <= high for a, b in ends(panel))
@@ -193,25 +161,7 @@ def test_only_equal_time_steps_are_compared_by_the_step_error():
     (chart,) = pareto_charts(rows, curve_styles(rows["label"]))
     shown = curves_in(chart)
     assert shown["over the step error, time step 10 ms"] == {"newton", "anderson"}
-    assert shown["over the trajectory error"] == {"newton", "anderson", "verlet", "lbfgs"}, (
-        "what failed is nowhere"
-    )
-
-
-def test_curves_of_one_label_are_told_apart_by_what_varies():
-    rows = as_table(
-        [
-            row_of("cg", cells=c, error=e, time_frame=1, true_error=e)
-            for e in (1e-2, 1e-4)
-            for c in (2000, 1000)
-        ]
-    )
-    (chart,) = growth_charts(rows)
-    assert list(chart.styles) == [
-        "cg, error 1e-2 (step error 1e-2)",
-        "cg, error 1e-4 (step error 1e-4)",
-    ]
-    assert len(set(chart.styles.values())) == 2
+    assert shown["over the trajectory error"] == {"newton", "anderson", "verlet", "lbfgs"}
 
 
 def test_the_page_is_well_formed_and_png_files_stand_beside_it(study: Path, text: str):
@@ -220,9 +170,8 @@ def test_the_page_is_well_formed_and_png_files_stand_beside_it(study: Path, text
     assert {path.name for path in study.glob("*.png")} == names
     assert all((study / name).read_bytes().startswith(b"\x89PNG") for name in names)
     ids = re.findall(r"""\sid=["']([^"']+)["']""", text)
-    assert {"chart-pareto-block-1000", "chart-growth-bunny-0-01"} <= set(ids) and len(
-        set(ids)
-    ) == len(ids)
+    assert {"chart-pareto-block-1000", "chart-growth-bunny-0-01"} <= set(ids)
+    assert len(set(ids)) == len(ids)
     assert "url(#" not in text and "xlink:href" not in text, "of another chart it may be"
 
 
@@ -257,24 +206,19 @@ def test_labels_are_escaped(tmp_path: Path):
     assert [path.name for path in tmp_path.glob("*.png")] == ["pareto_a_b_c__1000.png"]
 
 
-@pytest.mark.parametrize(
-    ("rows", "charts"),
-    [
-        ([], 0),
-        (ERRORS[:1], 1),
-        (ERRORS[-1:] * 3, 0),
-        (
-            [
-                row_of("a", true_error=bad, time_frame=0.1)
-                for bad in ("nan", "inf", "0", "-1", "", "?")
-            ],
-            0,
-        ),
-        ([row_of("a", true_error=1e-3, time_frame=0.1, time_step=0.01, cells="")], 1),
-    ],
-    ids=["no case", "one case", "all failed", "no number", "no cells"],
-)
-def test_tables_with_little_in_them(tmp_path: Path, rows: list, charts: int):
+BAD = ("nan", "inf", "0", "-1", "", "?")
+LITTLE = {
+    "no case": ([], 0),
+    "one case": (ERRORS[:1], 1),
+    "all failed": (ERRORS[-1:] * 3, 0),
+    "no number": ([row_of("a", true_error=bad, time_frame=0.1) for bad in BAD], 0),
+    "no cells": ([row_of("a", true_error=1e-3, time_frame=0.1, cells="")], 1),
+}
+
+
+@pytest.mark.parametrize("little", LITTLE)
+def test_tables_with_little_in_them(tmp_path: Path, little: str):
+    rows, charts = LITTLE[little]
     text = write_report(write_rows(tmp_path, rows)).read_text()
     assert Balance(text).open == [] and len(svgs(text)) == charts
 
@@ -286,11 +230,8 @@ def test_surface_errors_are_drawn_over_cost_a_curve_a_way_to_step(tmp_path: Path
         for label, errors in (("whole", (0.3, 0.2, 0.1)), ("fill", (0.2, 0.05, 0.01)))
         for n, time, error in zip((250, 700, 2000), (0.01, 0.02, 0.08), errors, strict=True)
     ]
-    rows.append(
-        row_of(
-            "fill", scene="heart", status="failed", reason="a pin holds no node", time_frame=1e-3
-        )
-    )
+    failed = {"status": "failed", "reason": "a pin holds no node", "time_frame": 1e-3}
+    rows.append(row_of("fill", scene="heart", **failed))
     text = write_report(write_rows(tmp_path, rows)).read_text()
     assert ">heart<" in text and (tmp_path / "size.png").is_file()
     # a chart over cost and a chart over cells

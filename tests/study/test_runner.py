@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from itertools import chain
 from pathlib import Path
 
 import pytest
@@ -21,11 +22,8 @@ from msmpetsc.study.table import COLUMNS, read_table, records, write_table
 
 
 def test_the_table_says_what_the_runs_said(tmp_path: Path, stand_in):
-    text = (
-        "repeats = 3\n"
-        + ONE_SCENE
-        + 'set = ["time.step=0.02"]\nreference = { integrator = "implicit-euler", step = 0.001 }\n'
-    )
+    text = f'repeats = 3\n{ONE_SCENE}set = ["time.step=0.02"]\n'
+    text += 'reference = { integrator = "implicit-euler", step = 0.001 }\n'
     text += '[[sweep]]\npresets = ["newton"]\ntime_steps = [0.01]\nerrors = [0.1]\nranks = [2]'
     (row,) = carry_out(tmp_path, text)
     assert set(row) == set(COLUMNS)
@@ -41,12 +39,8 @@ def test_the_table_says_what_the_runs_said(tmp_path: Path, stand_in):
     # least memory of the three repeats
     assert row["memory"] == 1000 - 4
     assert row["command"].startswith("mpiexec -n 2 msmpetsc run ")
-    left = [
-        path.name
-        for path in (tmp_path / "out").rglob("*")
-        if path.is_file() and "references" not in str(path)
-    ]
-    assert sorted(left) == ["calls.txt", "study.toml", "table.csv"]
+    left = {path.name for path in (tmp_path / "out").iterdir()}
+    assert left == {"calls.txt", "references", "study.toml", "table.csv"}
 
 
 def test_finished_cases_are_not_run_again(tmp_path: Path, stand_in):
@@ -67,17 +61,14 @@ def test_parts_run_apart_and_are_joined(tmp_path: Path, stand_in):
     path, out = study_file(tmp_path, text), tmp_path / "out"
     found = {index: run_study(path, out, part=(index, 2)) for index in (2, 1, 2)}
     assert [[row["error"] for row in found[index]] for index in (1, 2)] == [[0.3, 0.2], [0.1]]
-    assert (
-        not (out / "table.csv").exists()
-        and [done for _, done in list_study(path, out)] == [True] * 3
-    )
+    assert not (out / "table.csv").exists()
+    assert [done for _, done in list_study(path, out)] == [True] * 3
     logs = sorted(out.glob("parts/*/calls.txt"))
     assert [len(log.read_text().splitlines()) for log in logs] == [2, 1]
     rows = carry_out(tmp_path, text)
     assert [row["error"] for row in rows] == [0.3, 0.2, 0.1] and calls(tmp_path) == []
-    assert rows == [
-        row for part in ("1-of-2", "2-of-2") for row in records(read_table(out / "parts" / part))
-    ]
+    parts = (records(read_table(out / "parts" / part)) for part in ("1-of-2", "2-of-2"))
+    assert rows == [*chain.from_iterable(parts)]
 
 
 @pytest.mark.parametrize("part", ["3", "0/3", "4/3", "a/3"])
@@ -90,24 +81,16 @@ def test_the_list_names_each_case_and_runs_none(tmp_path: Path, capsys, own_log)
     path = study_file(tmp_path, ONE_SCENE + '[[sweep]]\npresets = ["newton", "anderson"]')
     assert main(["study", str(path), "-o", str(tmp_path / "out"), "--list"]) == 0
     first, second, last = capsys.readouterr().out.splitlines()
-    assert first.startswith("   1 open  a: newton  msmpetsc run ") and second.startswith(
-        "   2 open  a: anderson  "
-    )
+    assert first.startswith("   1 open  a: newton  msmpetsc run ")
+    assert second.startswith("   2 open  a: anderson  ")
     assert last == "2 cases, 0 done" and not (tmp_path / "out").exists()
 
 
 def test_a_case_that_fails_is_a_row_with_its_reason(tmp_path: Path, stand_in):
-    rows = carry_out(
-        tmp_path,
-        "repeats = 2\n"
-        + ONE_SCENE
-        + '[[sweep]]\npresets = ["newton"]\noptions = ["-ksp_fail", ""]',
-        jobs=2,
-    )
-    assert [(row["status"], row["reason"]) for row in rows] == [
-        ("failed", "planted, with reason"),
-        ("ok", ""),
-    ]
+    sweep = '[[sweep]]\npresets = ["newton"]\noptions = ["-ksp_fail", ""]'
+    rows = carry_out(tmp_path, f"repeats = 2\n{ONE_SCENE}{sweep}", jobs=2)
+    ends = [(row["status"], row["reason"]) for row in rows]
+    assert ends == [("failed", "planted, with reason"), ("ok", "")]
     assert rows[0]["time_frame"] is None and rows[0]["options"] == "-ksp_fail"
     # a failed case is not repeated
     assert len(calls(tmp_path)) == 3
@@ -144,11 +127,9 @@ runner.run_study(Path(sys.argv[2]), Path(sys.argv[3]))
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks at Linux's processes")
 def test_a_study_that_is_stopped_leaves_its_table_and_no_process(tmp_path: Path):
-    text = (
-        ONE_SCENE
-        + '[[sweep]]\npresets = ["newton"]\noptions = ["", "-ksp_children -ksp_hang", "-ksp_never"]'
-    )
-    paths = (STAND_IN, study_file(tmp_path, text), tmp_path / "out")
+    sweep = '[[sweep]]\npresets = ["newton"]\n'
+    sweep += 'options = ["", "-ksp_children -ksp_hang", "-ksp_never"]'
+    paths = (STAND_IN, study_file(tmp_path, ONE_SCENE + sweep), tmp_path / "out")
     words = [sys.executable, "-c", STUDY_IN_ITS_OWN_PROCESS, *map(str, paths)]
     heard = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # noqa: E731 (what runs in the background ignores it)
     study = subprocess.Popen(words, env=ENVIRONMENT, stderr=subprocess.DEVNULL, preexec_fn=heard)
@@ -173,16 +154,8 @@ def test_a_package_that_is_missing_is_told_before_anything_is_run(
 
 
 def test_a_table_read_and_written_again_is_the_same_text(tmp_path: Path):
-    row = {
-        "case": "1",
-        "cells": 1009,
-        "steps": 8,
-        "time_step": 1e-3,
-        "fps": 121.25,
-        "memory": 4e8,
-        "error": None,
-    }
-    row |= {"ranks": 1, "repeats": 1}
+    row = {"case": "1", "cells": 1009, "steps": 8, "time_step": 1e-3, "fps": 121.25}
+    row |= {"memory": 4e8, "error": None, "ranks": 1, "repeats": 1}
     write_table(tmp_path, [row])
     once = (tmp_path / "table.csv").read_text()
     write_table(tmp_path, records(read_table(tmp_path)))

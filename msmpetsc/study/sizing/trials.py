@@ -16,10 +16,7 @@ from msmpetsc.study.runner import Bench
 from msmpetsc.study.sizing.choice import Budget, Choice, PlannedMethod, SizePlan, SizeTrial, tables
 from msmpetsc.study.sizing.orders import ORDERS, ErrorLaw, cosine_of, error_law
 
-# ratio of cell edges between successive lattices, and of the scene's lattice to the
-# finest choice [-]
-REFINEMENT = 2
-# powers of REFINEMENT that coarsen the coarsest lattice; the first that runs is used
+# powers of 2 that coarsen the edges of the coarsest lattice; the first that runs is used
 COARSEST_POWERS = (2.0, 5 / 3, 4 / 3)
 # least cells of the finest lattice in the first round
 START_CELLS = 1000
@@ -29,9 +26,10 @@ STEP_MARGIN = 8
 OUT_OF_PHASE = 0.15
 # order assumed if lattices show none; clamped bars show 1.5 to 2
 USUAL_ORDER = 1.5
-# time limits of a trial on coarse lattices and on the finest [s]
-TIMEOUT, FINEST_TIMEOUT = 150.0, 900.0
+# time limit of a trial [s]
+TIMEOUT = 900.0
 MAX_CHOICES = 6
+CELLS_HINT = "--cells N says how many cells the finest trial has"
 # error over target at which a choice aims, and least ratio that ends the search [-]
 AIM, ACCEPTED = 0.9, 0.75
 
@@ -64,9 +62,7 @@ class Sizer:
         self.as_given = load_scene(scene)
         count = cells or self.as_given.cages.count
         if count is None:
-            raise InputError(
-                f"{scene} has cages.cell_size: --cells N says how many cells the finest trial has"
-            )
+            raise InputError(f"{scene} has cages.cell_size: {CELLS_HINT}")
         self.cells = count
         self.report = report
         self.advised = advised
@@ -82,8 +78,8 @@ class Sizer:
 
     @property
     def most(self) -> int:
-        """Largest number of cells that may be chosen."""
-        return REFINEMENT**3 * self.cells
+        """Largest number of cells that may be chosen, of half the edge."""
+        return 8 * self.cells
 
     def plan(self) -> SizePlan:
         """Return the plan, from trials first on few cells, then on more.
@@ -91,16 +87,15 @@ class Sizer:
         Raises InputError if too few trials succeed.
         """
         finest = self.cells
-        ratio = REFINEMENT**3
         # coarse cells lock thin walls, which hides the order of their error
-        while self.cells >= ratio * max(START_CELLS, self.advised):
-            self.cells //= ratio
+        while self.cells >= 8 * max(START_CELLS, self.advised):
+            self.cells //= 8
         while True:
             self.bounds.clear()
             plan = self._plan_on_lattices()
             if self.cells >= finest or (plan.met and plan.choice.cells <= self.cells / 2):
                 return plan
-            self.cells = min(finest, ratio * self.cells)
+            self.cells = min(finest, 8 * self.cells)
 
     def _plan_on_lattices(self) -> SizePlan:
         """Return the plan from lattices of at most ``cells`` cells."""
@@ -150,7 +145,7 @@ class Sizer:
                     f"{distance:.1e} apart"
                 )
             # verlet's substeps shorten with the edges of cells
-            elif explicit.cost * REFINEMENT < implicit.cost:
+            elif 2 * explicit.cost < implicit.cost:
                 return explicit.method, distance
         return implicit.method, allowed
 
@@ -171,8 +166,7 @@ class Sizer:
         if len(runs) < 2:
             raise InputError(
                 f"{self.scene}: only one lattice could be run, see above: "
-                "the error of the cells is not known; --cells N says how many cells the finest "
-                "trial has"
+                f"the error of the cells is not known; {CELLS_HINT}"
             )
         return list(runs.values())
 
@@ -185,21 +179,18 @@ class Sizer:
         distances = [_distance(*pair) for pair in pairwise(runs)]
         across = _distance(runs[0], runs[-1])
         cosine = cosine_of(distances[0], distances[1], across) if len(runs) > 2 else 0.0
-        is_out_of_phase = len(runs) > 2 and distances[0] > OUT_OF_PHASE
-        is_inverted = runs[-1].inverted > 0
-        least, greatest = ORDERS
-        orders = (USUAL_ORDER if is_out_of_phase else least, greatest)
         edges = [run.edge for run in runs]
-        if is_inverted:
+        least, greatest = ORDERS
+        if runs[-1].inverted > 0:
             law = error_law(edges, distances, (least, least), cosine)
-        else:
-            law = error_law(edges, distances, orders, cosine, USUAL_ORDER)
-        return replace(law, observed=law.observed and not is_inverted)
+            return replace(law, observed=False)
+        is_out_of_phase = len(runs) > 2 and distances[0] > OUT_OF_PHASE
+        orders = (USUAL_ORDER if is_out_of_phase else least, greatest)
+        return error_law(edges, distances, orders, cosine, USUAL_ORDER)
 
     def _coarser(self, power: float) -> int:
-        """Return the number of cells with edges REFINEMENT^power times as long."""
-        cells: float = self.cells / REFINEMENT ** (3 * power)
-        return max(1, round(cells))
+        """Return the number of cells with edges 2^power times as long."""
+        return max(1, round(self.cells / 8**power))
 
     def _refine_choice(
         self, method: PlannedMethod, time_error: float, law: ErrorLaw, lattices: Sequence[SizeTrial]
@@ -312,7 +303,7 @@ class Sizer:
         return Case(
             scene=self.scene.stem, file=self.scene, content="", set=tuple(overrides_of(changes)),
             ranks=self.ranks, integrator=method.integrator, time_step=self.step,
-            timeout=TIMEOUT if cells < self.cells else FINEST_TIMEOUT,
+            timeout=TIMEOUT,
         )  # fmt: skip
 
 

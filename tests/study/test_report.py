@@ -115,7 +115,7 @@ def test_twenty_options_are_told_apart_by_colour_and_mark():
     ])  # fmt: skip
     (chart,) = growth_charts(rows)
     assert len(set(chart.styles.values())) == 80
-    # curves of one label are told apart by what varies
+    # the options that vary name the curves of a label
     assert list(chart.styles)[1] == "option 0, error 1e-2 (step error 1e-2)"
 
 

@@ -26,17 +26,13 @@ def copy(bar_result: Path, tmp_path: Path) -> Path:
 def test_what_was_written_is_read(bar_result: Path):
     with msmpetsc.open(bar_result) as run:
         assert run.frames.time[:] == pytest.approx(DT * np.arange(FRAMES))
-        assert (
-            np.array_equal(run.frames.position[-1], position(FRAMES - 1))
-            and run.frames.position.unit == "m"
-        )
+        assert np.array_equal(run.frames.position[-1], position(FRAMES - 1))
+        assert run.frames.position.unit == "m"
         assert np.array_equal(run.lattice["nodes"], NODES) and run.lattice.cells.shape == (2, 8)
         assert run.scene["material"]["density"] == 1000 and run.attributes["ranks"] == 1
         assert run.surface.triangles[1, 2] == 3
-        assert np.allclose(run.embedding @ np.ones(len(NODES)), 1) and run.embedding.shape == (
-            len(POINTS),
-            len(NODES),
-        )
+        assert run.embedding.shape == (len(POINTS), len(NODES))
+        assert np.allclose(run.embedding @ np.ones(len(NODES)), 1)
         assert "5 frames of 12 nodes" in repr(run) and "elastic" in dir(run.frames)
         assert len(run.frames) == FRAMES and {"time", "position"} < set(run.frames)
     with pytest.raises(InputError, match="is closed"):
@@ -63,17 +59,10 @@ def test_lazy_arrays_are_indexed_as_numpys(bar_result: Path, key):
 @pytest.mark.parametrize(
     "key",
     [
-        5,
-        -6,
-        (0, 12),
-        (0, 0, 0, 0),
-        None,
-        ([0, 1], [0, 1]),
-        (..., 0, ...),
-        slice(None, None, -1),
+        5, -6, (0, 12), (0, 0, 0, 0), None, ([0, 1], [0, 1]), (..., 0, ...), slice(None, None, -1),
         [4, 0],
     ],
-)
+)  # fmt: skip
 def test_what_is_not_there_is_an_index_error(bar_result: Path, key):
     with msmpetsc.open(bar_result) as run, pytest.raises(IndexError):
         run.frames.position[key]
@@ -90,10 +79,8 @@ def test_a_file_that_is_being_written_has_its_finished_frames(tmp_path: Path):
         with msmpetsc.open(tmp_path / "x.h5") as run:
             file.append(frame(3))
             assert len(run.frames) == len(run.frames.time) == len(list(run.frames.position)) == 3
-            assert (
-                np.array_equal(run.frames.position[-1], position(2))
-                and np.isfinite(run.frames.time).all()
-            )
+            assert np.array_equal(run.frames.position[-1], position(2))
+            assert np.isfinite(run.frames.time).all()
 
 
 DIMENSIONS = {
@@ -108,15 +95,12 @@ DIMENSIONS = {
 
 def test_axes_of_frames_have_names_and_coordinates(tmp_path: Path):
     stress = {"stress": np.ones((len(NODES), 6)), "cell_von_mises": np.ones(2)}
-    with h5py.File(
-        small_result.write(tmp_path / "x.h5", [frame(k, **stress) for k in range(3)])
-    ) as file:
+    path = small_result.write(tmp_path / "x.h5", [frame(k, **stress) for k in range(3)])
+    with h5py.File(path) as file:
         frames = file["frames"]
         for name, dimensions in DIMENSIONS.items():
-            assert (
-                tuple(axis[0].name.removeprefix("/frames/") for axis in frames[name].dims)
-                == dimensions
-            )
+            names = (axis[0].name.removeprefix("/frames/") for axis in frames[name].dims)
+            assert tuple(names) == dimensions
         assert frames["axis"].asstr()[:].tolist() == ["x", "y", "z"]
         assert frames["component"].asstr()[:].tolist() == ["xx", "yy", "zz", "xy", "yz", "xz"]
         assert frames["node"].id.get_storage_size() == 0
@@ -138,10 +122,8 @@ def test_xarray_has_names_coordinates_and_units(bar_result: Path, engine: str):
         msmpetsc.open(bar_result) as run,
         xarray.open_dataset(bar_result, group="frames", engine=engine) as frames,
     ):
-        assert frames.position.dims == DIMENSIONS["position"] and set(frames.coords) == {
-            "time",
-            "axis",
-        }
+        assert frames.position.dims == DIMENSIONS["position"]
+        assert set(frames.coords) == {"time", "axis"}
         height = frames.position.sel(axis="z").sel(time=2 * DT, method="nearest")
         assert np.array_equal(height, run.frames.position[2][:, 2])
         assert frames.kinetic.attrs["units"] == "J" and frames.time.attrs["units"] == "s"
@@ -165,9 +147,7 @@ def test_a_file_of_an_older_version_is_read_without_what_it_lacks(copy: Path):
     with msmpetsc.open(copy) as run:
         assert "contact" not in run.frames and "points" not in run.surface
         assert run.embedding is None
-        with pytest.raises(
-            AttributeError, match="no frames/contact in this file, but time, position"
-        ):
+        with pytest.raises(AttributeError, match="no frames/contact in this file, but time, p"):
             _ = run.frames.contact
 
 
@@ -208,11 +188,6 @@ def cut(part: float) -> Callable[[Path], None]:
     return lambda path: path.write_bytes(path.read_bytes()[: int(part * path.stat().st_size)])
 
 
-def linked_away(file: h5py.File) -> None:
-    del file["frames/position"]
-    file["frames/position"] = h5py.ExternalLink("not_there.h5", "/x")
-
-
 HUGE = dict(shape=(10**12,), dtype="f8", chunks=(1000,))
 BAD = {
     "cut in half": (cut(0.5), "is damaged or cut short: .*truncated"),
@@ -237,7 +212,6 @@ BAD = {
     "2 long along axis 2, and 3 are expected"),
     "too few energies": (replaced("frames/kinetic", np.ones(3)),
     "3 long along axis 0, and 5 frames are finished"),
-    "linked away": (damage(linked_away), "position"),
 }  # fmt: skip
 
 
@@ -251,12 +225,9 @@ def test_a_bad_file_ends_in_one_line(copy: Path, name: str):
     assert str(told.value).startswith(str(copy)) and "\n" not in str(told.value)
 
 
-def indices_out_of_range(file: h5py.File) -> None:
-    file["embedding/indices"][3] = 10**6
-
-
-def springs_out_of_range(file: h5py.File) -> None:
-    file["lattice/springs"][3] = -1
+def number(name: str, value: int) -> Callable[[Path], None]:
+    """Return the change of a dataset's fourth row to a value."""
+    return damage(lambda file: file[name].__setitem__(3, value))
 
 
 @pytest.mark.parametrize(
@@ -264,13 +235,9 @@ def springs_out_of_range(file: h5py.File) -> None:
     [
         (attribute("scene", None), "scene", "does not say its scene"),
         (attribute("scene", "a = [[["), "scene", "its scene is not TOML"),
-        (damage(indices_out_of_range), "embedding", "embedding is no matrix"),
+        (number("embedding/indices", 10**6), "embedding", "embedding is no matrix"),
         (replaced("embedding/weights"), "embedding", "it has no embedding/weights"),
-        (
-            damage(springs_out_of_range),
-            "springs",
-            "lattice/springs has numbers outside its 12 nodes",
-        ),
+        (number("lattice/springs", -1), "springs", "springs has numbers outside its 12 nodes"),
     ],
 )
 def test_what_is_wrong_in_a_part_is_told_when_it_is_asked_for(

@@ -16,9 +16,8 @@ from msmpetsc.results.progress_bar import Progress
 
 
 def frame(index: int) -> Frame:
-    return blank_frame(
-        index=index, time=index / 60, position=np.zeros((0, 3)), step_error=8.1e-4, ksp_its=45
-    )
+    place = dict(index=index, time=index / 60, position=np.zeros((0, 3)))
+    return blank_frame(step_error=8.1e-4, ksp_its=45, **place)
 
 
 class Terminal(io.StringIO):
@@ -37,12 +36,8 @@ def shown(monkeypatch, stream: io.StringIO, indices: range, **options) -> str:
 
 
 def test_a_log_has_a_line_now_and_then(monkeypatch):
-    assert [
-        line.split()[1] for line in shown(monkeypatch, io.StringIO(), range(101)).splitlines()
-    ] == [
-        "0/100",
-        "100/100",
-    ]
+    lines = shown(monkeypatch, io.StringIO(), range(101)).splitlines()
+    assert [line.split()[1] for line in lines] == ["0/100", "100/100"]
     monkeypatch.setattr(progress_bar, "LINE_EVERY", 0.0)
     lines = shown(monkeypatch, io.StringIO(), range(101)).splitlines()
     assert [line.split()[1] for line in lines] == [f"{index}/100" for index in range(101)]
@@ -54,10 +49,8 @@ def test_a_resumed_run_counts_its_own_frames_for_the_rate(monkeypatch):
     # time passes whenever tqdm asks for it
     monkeypatch.setattr("tqdm.std.time", count(0.0, 0.1).__next__)
     lines = shown(monkeypatch, io.StringIO(), range(50, 60)).splitlines()
-    assert (
-        lines[0].startswith("frame 50/100")
-        and 0 < float(re.search(r"([\d.]+)frame/s", lines[-1])[1]) <= 10
-    )
+    assert lines[0].startswith("frame 50/100")
+    assert 0 < float(re.search(r"([\d.]+)frame/s", lines[-1])[1]) <= 10
 
 
 @pytest.mark.parametrize("kind", [io.StringIO, Terminal])

@@ -16,7 +16,7 @@ from msmpetsc.study.runner import Bench
 from msmpetsc.study.sizing.choice import Budget, Choice, PlannedMethod, SizePlan, SizeTrial, tables
 from msmpetsc.study.sizing.orders import ORDERS, ErrorLaw, cosine_of, error_law
 
-# powers of 2 that coarsen the edges of the coarsest lattice; the first that runs is used
+# powers of 2 that coarsen the coarsest lattice; the first that runs is used
 COARSEST_POWERS = (2.0, 5 / 3, 4 / 3)
 # least cells of the finest lattice in the first round
 START_CELLS = 1000

@@ -3,6 +3,7 @@
 import io
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import h5py
@@ -24,31 +25,17 @@ WORKER = WORKERS / "frames_worker.py"
 
 
 def run_on_ranks(ranks: int, action: str, path: Path) -> str:
-    done = run(ranks, WORKER, action, path, status=0)
-    return done.stdout
+    return run(ranks, WORKER, action, path, status=0).stdout
 
 
-def write_serial(path: Path, count: int, planned: int = STEPS + 1) -> None:
-    with ResultFile(path, MPI.COMM_SELF, {}) as file:
-        file.start_frames(planned, NODES, {"surface": POINTS})
-        for index in range(count):
-            file.append(frame(index))
-
-
-def assert_holds(file: h5py.File, count: int, surface: str | None = "f8") -> None:
+def assert_holds(file: h5py.File, count: int, surface: bool = True) -> None:
     """Assert that the first ``count`` frames are the frames of frames_worker, bit for bit."""
     expected = [frame(index) for index in range(count)]
-    fields = {
-        name: FRAME_FIELDS[name].dtype
-        for name in FRAME_FIELDS.keys() & file["frames"]
-        if name != "surface"
-    }
-    assert {
-        "position",
-        *(name for name, field in FRAME_FIELDS.items() if field.shape == ("T",)),
-    } <= set(fields)
-    if surface is not None:
-        fields["surface"] = surface
+    fields = {name: FRAME_FIELDS[name].dtype for name in FRAME_FIELDS.keys() & file["frames"]}
+    numbers = {name for name, field in FRAME_FIELDS.items() if field.shape == ("T",)}
+    assert {"position", *numbers} <= fields.keys()
+    if not surface:
+        fields.pop("surface", None)
     for name, kind in fields.items():
         stored = file["frames"][name][:count]
         wanted = np.array([getattr(one, name) for one in expected], kind).reshape(stored.shape)
@@ -57,11 +44,9 @@ def assert_holds(file: h5py.File, count: int, surface: str | None = "f8") -> Non
 
 def newest_checkpoint(file: h5py.File) -> tuple[int, np.ndarray, np.ndarray] | None:
     """Return step, q and q_previous of a file's newest checkpoint; it need not have a path."""
-    group = file["checkpoint"]
-    slot = newest_slot(group["step"][:])
-    return (
-        None if slot is None else (group["step"][slot], group["q"][slot], group["q_previous"][slot])
-    )
+    slot = newest_slot(file["checkpoint/step"][:])
+    names = ("step", "q", "q_previous")
+    return None if slot is None else tuple(file[f"checkpoint/{name}"][slot] for name in names)
 
 
 @pytest.mark.parametrize("ranks", [1, 3])
@@ -72,36 +57,19 @@ def test_layout_is_that_of_the_design_on_any_ranks(tmp_path, ranks):
     with h5py.File(tmp_path / "out" / "x.h5") as file:
         assert finished(file) == STEPS + 1
         assert_holds(file, STEPS + 1)
-        assert {**file.attrs} == {
-            "format": "msmpetsc",
-            "format_version": 1,
-            "scene": "title = 'a test'",
-            "ranks": 3,
-        }
-        assert (
-            file["frames/position"].shape == (STEPS + 1, NODES, 3)
-            and file["frames/position"].dtype == "f8"
-        )
-        assert (
-            file["frames/surface"].shape == (STEPS + 1, POINTS, 3)
-            and file["frames/surface"].dtype == "f8"
-        )
+        attributes = {"format": "msmpetsc", "format_version": 1, "ranks": 3}
+        assert {**file.attrs} == attributes | {"scene": "title = 'a test'"}
+        for name, rows in (("position", NODES), ("surface", POINTS)):
+            dataset = file["frames"][name]
+            assert dataset.shape == (STEPS + 1, rows, 3) and dataset.dtype == "f8"
         assert np.array_equal(file["lattice/nodes"], positions(0, NODES))
         assert np.array_equal(file["lattice/springs"], np.arange(2 * NODES).reshape(-1, 2))
         assert file["lattice/pinned"].shape == (0,)
-        units = {
-            name: file["frames"][name].attrs["units"]
-            for name in FRAME_FIELDS.keys() & file["frames"]
-        }
-        assert (
-            units["momentum"] == "kg m/s" and units["elastic"] == "J" and units["position"] == "m"
-        )
-        assert file["lattice/nodes"].attrs["units"] == "m"
+        units = {"frames/momentum": "kg m/s", "frames/elastic": "J", "lattice/nodes": "m"}
+        assert {name: file[name].attrs["units"] for name in units} == units
         step, q, q_previous = newest_checkpoint(file)
-        assert step == STEPS
-        assert np.array_equal(q, positions(STEPS, NODES)) and np.array_equal(
-            q_previous, positions(STEPS - 1, NODES)
-        )
+        assert step == STEPS and np.array_equal(q, positions(STEPS, NODES))
+        assert np.array_equal(q_previous, positions(STEPS - 1, NODES))
 
 
 def test_who_writes_does_not_show_in_the_file(tmp_path):
@@ -147,20 +115,12 @@ def test_going_on_writes_nothing_but_numbers_in_their_places(tmp_path, monkeypat
     """The same holds from the opening of a file that a kill has left until it is closed."""
     path, disk = tmp_path / "x.h5", Disk()
     with ResultFile(path, MPI.COMM_SELF, {}) as file:
-        file.start_frames(9, NODES, {"surface": POINTS})
-        for index in range(3):
-            file.append(frame(index))
-            file.write_checkpoint(saved(index))
+        write_frames(file, range(3))
     before = path.read_bytes()
     io.BytesIO.write(disk, before)
     disk.replace_file(monkeypatch)
-    file = ResultFile(path, MPI.COMM_SELF, {}, Begin.IN_PLACE)
-    file.start_frames(9, NODES, {"surface": POINTS})
-    assert file.finished == 3
-    for index in range(3, 6):
-        file.append(frame(index))
-        file.write_checkpoint(saved(index))
-    file.close()
+    with ResultFile(path, MPI.COMM_SELF, {}, Begin.IN_PLACE) as file:
+        write_frames(file, range(3, 6))
     with h5py.File(io.BytesIO(before)) as laid:
         numbers = sorted(places(laid))
     # the file was neither cut nor extended
@@ -173,15 +133,23 @@ def test_going_on_writes_nothing_but_numbers_in_their_places(tmp_path, monkeypat
         with h5py.File(io.BytesIO(image), "r") as killed:
             assert_holds(killed, finished(killed))
             step, q, _ = newest_checkpoint(killed)
-            assert step in (finished(killed) - 1, finished(killed) - 2) and np.array_equal(
-                q, positions(step, NODES)
-            )
+            assert step in (finished(killed) - 1, finished(killed) - 2)
+            assert np.array_equal(q, positions(step, NODES))
+
+
+def write_frames(file: ResultFile, indices: range) -> None:
+    """Lay out nine frames and write some of them, each with a checkpoint."""
+    file.start_frames(9, NODES, {"surface": POINTS})
+    assert file.finished == indices.start
+    for index in indices:
+        file.append(frame(index))
+        file.write_checkpoint(saved(index))
 
 
 def saved(index: int) -> Checkpoint:
-    return Checkpoint(
-        index, {"q": positions(index, NODES), "q_previous": positions(index - 1, NODES)}
-    )
+    """Return the checkpoint of a frame."""
+    rows = {"q": positions(index, NODES), "q_previous": positions(index - 1, NODES)}
+    return Checkpoint(index, rows)
 
 
 def places(file: h5py.File) -> Iterator[tuple[int, int]]:
@@ -221,14 +189,11 @@ class Disk(io.BytesIO):
 
     def truncate(self, size=None):
         self.log.append(size)
-        self._stretch(size)
-        return super().truncate(size)
-
-    def _stretch(self, size):
         here = self.tell()
         missing = size - self.seek(0, io.SEEK_END)
         super().write(bytes(max(0, missing)))
         self.seek(here)
+        return super().truncate(size)
 
     def images(self, start, begin=b""):
         """Yield (number of changes made, content) after each change from the start-th on."""
@@ -246,15 +211,10 @@ class Disk(io.BytesIO):
 
 @pytest.mark.parametrize("failure", [None, RuntimeError])
 def test_ended_early_it_has_its_finished_frames(tmp_path, failure):
-    try:
-        with ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
-            file.start_frames(STEPS + 1, NODES, {"surface": POINTS})
-            for index in range(4):
-                file.append(frame(index))
-            if failure:
-                raise failure
-    except RuntimeError:
-        assert failure
+    with suppress(RuntimeError), ResultFile(tmp_path / "x.h5", MPI.COMM_SELF, {}) as file:
+        write_frames(file, range(4))
+        if failure:
+            raise failure
     with open_result(tmp_path / "x.h5") as file:
         assert finished(file) == 4
         assert_holds(file, 4)
@@ -269,7 +229,8 @@ def test_planned_frames_take_no_disk_until_written(tmp_path):
 
 def test_replaced_only_when_told_and_only_by_a_new_one(tmp_path):
     path = tmp_path / "x.h5"
-    write_serial(path, 3)
+    with ResultFile(path, MPI.COMM_SELF, {}) as file:
+        write_frames(file, range(3))
     with pytest.raises(InputError, match=r"x\.h5 exists: --overwrite replaces it"):
         ResultFile(path, MPI.COMM_SELF, {})
     with ResultFile(path, MPI.COMM_SELF, {}, Begin.OVERWRITE):
@@ -286,10 +247,10 @@ def test_replaced_only_when_told_and_only_by_a_new_one(tmp_path):
 
 def test_refused_on_all_ranks_together(tmp_path):
     path = tmp_path / "x.h5"
-    write_serial(path, 1)
-    assert (
-        run_on_ranks(2, "refuse", path) == f"refused: {path} exists: --overwrite replaces it\n" * 2
-    )
+    with ResultFile(path, MPI.COMM_SELF, {}) as file:
+        write_frames(file, range(1))
+    refused = f"refused: {path} exists: --overwrite replaces it\n"
+    assert run_on_ranks(2, "refuse", path) == refused * 2
     # the folder is a file
     assert run_on_ranks(2, "refuse", path / "y.h5").count("cannot be written: ") == 2
 
@@ -297,14 +258,12 @@ def test_refused_on_all_ranks_together(tmp_path):
 @pytest.mark.parametrize("action", ["full", "full for one"])
 def test_full_disk_stops_all_ranks_with_one_line_and_keeps_the_frames(tmp_path, action):
     path = tmp_path / "x.h5"
-    assert (
-        run_on_ranks(3, action, path)
-        == f"refused: {path} cannot be written: No space left on device\n" * 3
-    )
+    refused = f"refused: {path} cannot be written: No space left on device\n"
+    assert run_on_ranks(3, action, path) == refused * 3
     with open_result(path) as file:
         # the file is unchanged, so that a run can continue
         assert finished(file) == 2 and len(file["frames/position"]) == STEPS + 1
-        assert_holds(file, 2, None)
+        assert_holds(file, 2, surface=False)
 
 
 def test_too_small_a_disk_is_told_before_the_first_frame(tmp_path):

@@ -71,9 +71,8 @@ def page(result: Path, path: Path) -> None:
 
 def chart(path: Path) -> None:
     made = Chart(path.stem, "sizes", "a title", "", curve_styles(["a", "b"]))
-    made.panel("", log_axis("x", [1, 10], COUNT), log_axis("y", [1, 10], COUNT)).stair(
-        [1, 10], [1, 10]
-    )
+    axis = log_axis("x", [1, 10], COUNT)
+    made.panel("", axis, axis).stair([1, 10], [1, 10])
     save_png(made, path.parent)
 
 
@@ -90,49 +89,37 @@ def ask_for_no_cases(path: Path) -> None:
 def writers(sources: Path) -> dict[str, Writer]:
     """Return the writers by names of their files."""
     bar, ball = sources / "bar.h5", sources / "ball.h5"
+    to_plan = "[time] # mine\nstep = 0.1\nduration = 1.0\n"
+    from_pile = lambda path: new.run(parsed(["new", str(path), "--from", "pile"]))  # noqa: E731
+    planned = tables(PlannedMethod("verlet"))
+    studied = lambda path: run_study(path.parent.with_name("asked.toml"), path.parent)  # noqa: E731
+    no_rows = lambda path: write_table(path.parent, [])  # noqa: E731
+    result = lambda path: small_result.write(path.with_suffix(".h5"))  # noqa: E731
+    xdmf = lambda path: write_xdmf(path.with_suffix(".h5"))  # noqa: E731
     table = {
         "x.h5": Writer("results/writer.py", small_result.write),
-        "x.xdmf": Writer(
-            "results/xdmf.py",
-            lambda path: write_xdmf(path.with_suffix(".h5")),
-            lambda path: small_result.write(path.with_suffix(".h5")),
-        ),
-        "x.toml": Writer(
-            "cli/commands/new.py",
-            lambda path: new.run(parsed(["new", str(path), "--from", "pile"])),
-        ),
-        "x.baseline.json": Writer(
-            "results/baseline.py", lambda path: baseline.write(path, NUMBERS)
-        ),
+        "x.xdmf": Writer("results/xdmf.py", xdmf, result),
+        "x.toml": Writer("cli/commands/new.py", from_pile),
+        "x.baseline.json": Writer("results/baseline.py", lambda x: baseline.write(x, NUMBERS)),
         "planned.toml": Writer(
             "study/sizing/choice.py",
-            lambda path: put_into(path, tables(PlannedMethod("verlet"))),
-            lambda path: path.write_text("[time] # mine\nstep = 0.1\nduration = 1.0\n"),
+            lambda x: put_into(x, planned),
+            lambda x: x.write_text(to_plan),
         ),
-        "table.csv": Writer("study/table.py", lambda path: write_table(path.parent, [])),
-        "study.toml": Writer(
-            "study/runner.py",
-            lambda path: run_study(path.parent.with_name("asked.toml"), path.parent),
-            ask_for_no_cases,
-        ),
-        "report.html": Writer(
-            "study/report.py",
-            lambda path: write_report(path.parent),
-            lambda path: write_table(path.parent, []),
-        ),
+        "table.csv": Writer("study/table.py", no_rows),
+        "study.toml": Writer("study/runner.py", studied, ask_for_no_cases),
+        "report.html": Writer("study/report.py", lambda x: write_report(x.parent), no_rows),
         "chart.png": Writer("study/charts/plot.py", chart),
     }
+    draw, show = partial(contact_sheet, ball), partial(page, ball)
     table |= {f"y{end}": Writer("export/formats.py", partial(export, bar)) for end in FORMATS}
-    table |= {
-        f"z{end}": Writer("view/sheet.py", partial(contact_sheet, ball)) for end in PICTURE_NAMES
-    }
+    table |= {f"z{end}": Writer("view/sheet.py", draw) for end in PICTURE_NAMES}
     table |= {f"z{end}": Writer("view/film.py", film) for end in MOVIE_NAMES}
-    return table | {f"z{end}": Writer("view/page.py", partial(page, ball)) for end in PAGE_NAMES}
+    return table | {f"z{end}": Writer("view/page.py", show) for end in PAGE_NAMES}
 
 
-NUMBERS = baseline.Numbers(
-    run=baseline.Recipe(cells=None, steps=1), counts={}, scales={}, numbers={}
-)
+RECIPE = baseline.Recipe(cells=None, steps=1)
+NUMBERS = baseline.Numbers(run=RECIPE, counts={}, scales={}, numbers={})
 NAMES = [*writers(Path())]
 # writers that never end a run, or that only a run can call; they use the same function
 NOT_TRIED = {"app/summary.py", "app/exported_systems.py", "cli/commands/series.py"}
@@ -187,11 +174,8 @@ def test_an_older_file_stays_where_a_new_one_fails(sources: Path, tmp_path: Path
     assert contents(tmp_path) == {"x.obj": b"old"}
     (tmp_path / "link.obj").symlink_to(path)
     export(sources / "bar.h5", tmp_path / "link.obj")
-    assert (
-        (tmp_path / "link.obj").is_symlink()
-        and path.stat().st_size > 3
-        and path.stat().st_mode & 0o777 == 0o640
-    )
+    assert (tmp_path / "link.obj").is_symlink() and path.stat().st_size > 3
+    assert path.stat().st_mode & 0o777 == 0o640
 
 
 BY_HAND = re.compile(
@@ -212,10 +196,7 @@ ALLOWED = {
 def test_nothing_is_written_by_hand():
     texts = {str(path.relative_to(PACKAGE)): path.read_text() for path in PACKAGE.rglob("*.py")}
     assert {name for name, text in texts.items() if BY_HAND.search(text)} == ALLOWED.keys()
-    users = {
-        name
-        for name, text in texts.items()
-        if re.search(r"import .*\b(whole_file|write_whole)\b", text)
-    }
+    ways = re.compile(r"import .*\b(whole_file|write_whole)\b")
+    users = {name for name, text in texts.items() if ways.search(text)}
     tried = {writer.module for writer in writers(Path()).values()}
     assert users | {"results/writer.py"} == tried | NOT_TRIED

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from mpi4py import MPI
-from scipy.sparse import csr_array
 from study_stand_in import blank_frame
 
 from msmpetsc.results.writer import Begin, ResultFile
@@ -19,6 +18,12 @@ time = { step = 0.1, duration = 1.0 }
 EAST_HELD = """
 [[pin]]
 region = { half_space = { point = [0.02, 0, 0], normal = [1, 0, 0] } }
+"""
+LED = """
+[[anchor]]
+region = { half_space = { point = [0, 0, 0.48], normal = [0, 0, -1] } }
+path = [{ time = 1.0, by = [0, 0, 1] }]
+stop = 0.5
 """
 SCENE = f"""
 {BARE}
@@ -40,20 +45,16 @@ def write_ball(path: Path, scene: str = SCENE) -> Path:
     """Write the result; points of the ball are also nodes, pinned if the scene has EAST_HELD."""
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
     rows = len(ball.vertices)
-    embedding = csr_array(np.eye(rows))
     with ResultFile(path, MPI.COMM_SELF, {"scene": scene}, Begin.OVERWRITE) as file:
         file.write("surface/triangles", np.array(ball.faces))
-        file.write("surface/points", ball.vertices + np.array([0, 0, HEIGHTS[0]]))
         file.write("lattice/cells", np.zeros((1, 8), int))
-        file.write("lattice/nodes", ball.vertices + np.array([0, 0, HEIGHTS[0]]))
+        for name in ("surface/points", "lattice/nodes"):
+            file.write(name, ball.vertices + np.array([0, 0, HEIGHTS[0]]))
         if EAST_HELD in scene:
             file.write("lattice/pinned", np.flatnonzero(ball.vertices[:, 0] >= 0.02))
-        for name, part in (
-            ("weights", embedding.data),
-            ("indices", embedding.indices),
-            ("indptr", embedding.indptr),
-        ):
-            file.write(f"embedding/{name}", part)
+        file.write("embedding/weights", np.ones(rows))
+        file.write("embedding/indices", np.arange(rows, dtype="i4"))
+        file.write("embedding/indptr", np.arange(rows + 1, dtype="i4"))
         file.start_frames(len(HEIGHTS), rows, {"surface": rows})
         for index, height in enumerate(HEIGHTS):
             points = ball.vertices * [1, 1, min(1, height / 0.1)] + [0, 0, height]

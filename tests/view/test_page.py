@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from ball_result import BARE, HEIGHTS, write_ball
+from ball_result import BARE, HEIGHTS, LED, write_ball
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -26,10 +26,8 @@ def written_page(folder: Path, *words: str, scene: str | None = None) -> Path:
 
 
 def data_of(path: Path) -> dict:
-    text = path.read_text(encoding="utf-8")
-    return json.loads(
-        re.search(r'<script id="data" type="application/json">(.*?)</script>', text, re.DOTALL)[1]
-    )
+    script = re.compile(r'<script id="data" type="application/json">(.*?)</script>', re.DOTALL)
+    return json.loads(script.search(path.read_text(encoding="utf-8"))[1])
 
 
 def stream(data: dict, name: str) -> np.ndarray:
@@ -41,13 +39,10 @@ def restored(raw: np.ndarray, frames: int) -> np.ndarray:
     return np.cumsum(raw.view("<u2").reshape(frames, -1), axis=0, dtype=np.uint16)
 
 
-@given(
-    arrays(
-        np.uint16,
-        (4, 6),
-        elements=st.sampled_from([0, 1, 2, 255, 256, 32767, 32768, 40000, 65534, 65535]),
-    )
-)
+NUMBERS = st.sampled_from([0, 1, 2, 255, 256, 32767, 32768, 40000, 65534, 65535])
+
+
+@given(arrays(np.uint16, (4, 6), elements=NUMBERS))
 def test_any_frames_come_out_of_their_differences(frames):
     raw = np.frombuffer(zlib.decompress(page.deflated(frames)), np.uint8)
     assert (restored(raw, len(frames)) == frames).all()
@@ -63,17 +58,14 @@ def test_the_page_holds_every_frame_to_its_levels(tmp_path):
             # the points of the nodes
             error = abs(low + frame / 65535 * (high - low) - run.frames.position[index])
             assert (error <= 0.5001 * (high - low) / 65535).all()
-        assert (
-            stream(data, "triangles").view("<u2").reshape(-1, 3) == run.surface.triangles[:]
-        ).all()
+        triangles = stream(data, "triangles").view("<u2").reshape(-1, 3)
+        assert (triangles == run.surface.triangles[:]).all()
     assert data["times"] == pytest.approx([index / 10 for index in range(11)])
 
 
 def test_the_page_loads_nothing(tmp_path):
     text = written_page(tmp_path).read_text(encoding="utf-8")
-    assert not re.search(
-        r"""(src|href)\s*=|@import|https?://(?!www\.w3\.org/2000/svg)|\{\{""", text
-    )
+    assert not re.search(r"(src|href)\s*=|@import|https?://(?!www\.w3\.org/2000/svg)|\{\{", text)
 
 
 def test_a_title_cannot_end_the_script(tmp_path):
@@ -87,15 +79,9 @@ def test_colours_come_out_as_shares_of_the_scale(tmp_path):
     data = data_of(written_page(tmp_path, "--colour", "displacement"))
     shares = np.cumsum(stream(data, "colours").reshape(len(HEIGHTS), -1).astype(int), axis=0) % 256
     assert (shares[0] == 0).all() and shares.max() == 255
-    assert data["legend"][0]["kind"] == "bar" and data["legend"][0]["text"] == "displacement [mm]"
-    assert [number for _, number in data["legend"][0]["ticks"]] == [
-        "0",
-        "100",
-        "200",
-        "300",
-        "400",
-        "500",
-    ]
+    bar = data["legend"][0]
+    assert bar["kind"] == "bar" and bar["text"] == "displacement [mm]"
+    assert [number for _, number in bar["ticks"]] == ["0", "100", "200", "300", "400", "500"]
 
 
 def test_a_page_too_large_has_fewer_frames_and_says_so(tmp_path, monkeypatch, caplog):
@@ -108,11 +94,6 @@ def test_a_page_too_large_has_fewer_frames_and_says_so(tmp_path, monkeypatch, ca
 
 
 def test_anchored_points_are_free_after_their_stop(tmp_path):
-    anchor = (
-        "[[anchor]]\nregion = { half_space = { point = [0, 0, 0.48], normal = [0, 0, -1] } }\n"
-        "stop = 0.5\n"
-    )
-    anchor += "path = [{ time = 1.0, by = [0, 0, 1] }]\n"
-    data = data_of(written_page(tmp_path, scene=BARE + anchor))
+    data = data_of(written_page(tmp_path, scene=BARE + LED))
     fixed = np.cumsum(stream(data, "fixed").reshape(len(HEIGHTS), -1), axis=0, dtype=np.uint8)
     assert (fixed[:5] == fixed[0]).all() and set(fixed[0]) == {0, 255} and not fixed[5:].any()

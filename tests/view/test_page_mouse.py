@@ -53,9 +53,8 @@ def test_dragging_turns_the_body(browser: Browser):
     assert abs(browser.value("view.yaw")) == pytest.approx(180) and before > 1000
     assert dark(browser) < 0.05 * before
     browser.drag((left[0] + 450, left[1]), (-450, 0))
-    assert browser.value("view.yaw") == pytest.approx(0) and dark(browser) == pytest.approx(
-        before, rel=0.01
-    )
+    assert browser.value("view.yaw") == pytest.approx(0)
+    assert dark(browser) == pytest.approx(before, rel=0.01)
     browser.drag(middle, (0, 100))
     # 0.4 degrees per pixel
     assert browser.value("view.pitch") == pytest.approx(40)
@@ -68,9 +67,8 @@ def test_the_wheel_comes_nearer_and_goes_away(browser: Browser):
     browser.wheel(browser.middle("#view"), -300)
     browser.until("view.zoom > 1")
     zoom = browser.value("view.zoom")
-    assert np.ptp(seen(browser), axis=0) == pytest.approx(
-        zoom * first, rel=0.03
-    ) and zoom == pytest.approx(np.exp(0.3))
+    assert zoom == pytest.approx(np.exp(0.3))
+    assert np.ptp(seen(browser), axis=0) == pytest.approx(zoom * first, rel=0.03)
     browser.wheel(browser.middle("#view"), 600)
     browser.until("view.zoom < 1")
     assert np.ptp(seen(browser), axis=0) == pytest.approx(first * np.exp(-0.3), rel=0.03)
@@ -116,6 +114,5 @@ def test_the_slider_goes_to_a_frame(browser: Browser):
     browser.click((x + (0.3 - 0.5) * (width - 16), y))
     assert browser.value("view.frame") == 3
     assert "0.300 s" in browser.value("byId('time').textContent")
-    assert (seen(browser).mean(axis=0) - first.mean(axis=0))[0] == pytest.approx(
-        0.4 * metre, rel=0.05
-    )
+    lower, _ = seen(browser).mean(axis=0) - first.mean(axis=0)
+    assert lower == pytest.approx(0.4 * metre, rel=0.05)

@@ -31,10 +31,7 @@ path = [{ time = 1.0, by = [0, 0, -0.4] }]
 stop = 0.95
 """
 # box to the right of the ball [m]
-LOW, HIGH = (
-    np.array([0.15, -0.05, 0.45]),
-    np.array([0.25, 0.05, 0.55]),
-)
+LOW, HIGH = np.array([0.15, -0.05, 0.45]), np.array([0.25, 0.05, 0.55])
 
 
 BAR = np.array([[0.15, -0.05, 0.49], [0.25, 0.05, 0.51]])
@@ -44,12 +41,8 @@ path = [{ time = 1.0, turn = [0, 90, 0] }]
 center = [0.2, 0, 0.5]
 response = "barrier"
 """
-TWO_BARS = (
-    TURNING
-    + f'shape = "box"\nbox = {BAR.tolist()}'
-    + TURNING
-    + 'shape = "mesh"\nmesh.source = "bar.ply"'
-)
+TWO_BARS = f'''{TURNING}shape = "box"\nbox = {BAR.tolist()}
+{TURNING}shape = "mesh"\nmesh.source = "bar.ply"'''
 
 
 @pytest.fixture
@@ -103,9 +96,7 @@ def test_a_page_has_it_once_and_moves_it(result: Path):
     with Browser(path) as browser:
         pictures = [browser.picture() for frame in (0, 5) if not browser.value(f"goTo({frame})")]
     rows, columns, metre = right_of_the_ball(pictures[0])
-    assert np.ptp(rows) == pytest.approx(0.1 * metre, rel=0.1) and np.ptp(columns) == pytest.approx(
-        0.1 * metre, rel=0.1
-    )
+    assert [np.ptp(rows), np.ptp(columns)] == pytest.approx([0.1 * metre] * 2, rel=0.1)
     sunk = right_of_the_ball(pictures[1])[0]
     assert sunk.mean() - rows.mean() == pytest.approx(0.2 * metre, rel=0.1)
 
@@ -113,9 +104,8 @@ def test_a_page_has_it_once_and_moves_it(result: Path):
 @in_browser
 def test_a_bar_that_turns_is_drawn_as_it_has_turned(tmp_path: Path):
     """A box and a mesh, lying at first, are upright at the end."""
-    path = with_mesh(
-        write_ball(tmp_path / "x.h5", scene=BARE + "picture.eye = [0, -1, 0]" + TWO_BARS), BAR
-    )
+    scene = f"{BARE}picture.eye = [0, -1, 0]{TWO_BARS}"
+    path = with_mesh(write_ball(tmp_path / "x.h5", scene=scene), BAR)
     with Result(path) as run:
         (still,) = composition_of(drawable_of_result(run), [0, 10], Style()).stills([10])
         solid = solids_of(run)[1]

@@ -40,10 +40,7 @@ def test_a_scene_shows_pins_forces_and_cells(tmp_path):
     # the arrow is orange
     assert (left[..., 0] - left[..., 2] > 90).sum() > 300
     # cells of the boundary are red and inner cells blue in the cut-open panel
-    for less, more in (
-        (2, 0),
-        (0, 2),
-    ):
+    for less, more in ((2, 0), (0, 2)):
         counts = [(half[:-40, :, more] - half[:-40, :, less] > 75).sum() for half in (left, right)]
         assert counts[1] > 300 and counts[1] > 2 * counts[0]
 

@@ -42,10 +42,8 @@ def test_points_are_those_of_the_result_at_every_time(result: Path, tmp_path: Pa
     assert path.read_bytes().startswith(b"#usda" if ending == ".usda" else b"PXR-USDC")
     stage, (mesh,) = opened(path)
     rate = stage.GetTimeCodesPerSecond()
-    assert (
-        rate == pytest.approx(1 / DT)
-        and stage.GetEndTimeCode() - stage.GetStartTimeCode() == FRAMES - 1
-    )
+    assert rate == pytest.approx(1 / DT)
+    assert stage.GetEndTimeCode() - stage.GetStartTimeCode() == FRAMES - 1
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1 and UsdGeom.GetStageUpAxis(stage) == "Z"
     assert stage.GetDefaultPrim().GetPath() == mesh.GetPath().GetParentPath()
     assert mesh.GetPointsAttr().GetTimeSamples() == list(range(FRAMES))
@@ -53,13 +51,11 @@ def test_points_are_those_of_the_result_at_every_time(result: Path, tmp_path: Pa
     for index in (0, 1, 2.5, 4):
         code = Usd.TimeCode(index * DT * rate)
         points = np.array(mesh.GetPointsAttr().Get(code))
+        extent = np.array([points.min(axis=0), points.max(axis=0)])
         assert points_of(mesh, code) == pytest.approx(surface(index), abs=1e-6)
-        assert np.array(mesh.GetExtentAttr().Get(code)) == pytest.approx(
-            np.array([points.min(axis=0), points.max(axis=0)]), abs=1e-6
-        )
-        assert np.linalg.norm(np.array(mesh.GetNormalsAttr().Get(0)), axis=1) == pytest.approx(
-            1, abs=1e-6
-        )
+        assert np.array(mesh.GetExtentAttr().Get(code)) == pytest.approx(extent, abs=1e-6)
+    lengths = np.linalg.norm(np.array(mesh.GetNormalsAttr().Get(0)), axis=1)
+    assert lengths == pytest.approx(1, abs=1e-6)
 
 
 def test_points_far_from_the_origin_are_exact(tmp_path: Path):
@@ -72,14 +68,10 @@ def test_points_far_from_the_origin_are_exact(tmp_path: Path):
 def test_the_mesh_is_what_usd_asks_for(result: Path, tmp_path: Path):
     _stage, (mesh,) = opened(export(result, tmp_path / "y.usdc"))
     counts, corners = mesh.GetFaceVertexCountsAttr().Get(), mesh.GetFaceVertexIndicesAttr().Get()
-    assert (
-        list(counts) == [3, 3] and np.array(corners).reshape(-1, 3).tolist() == TRIANGLES.tolist()
-    )
+    assert list(counts) == [3, 3] and list(corners) == TRIANGLES.ravel().tolist()
     assert UsdGeom.Mesh.ValidateTopology(corners, counts, len(POINTS)) == (True, "")
-    assert (
-        mesh.GetSubdivisionSchemeAttr().Get() == "none"
-        and len(mesh.GetDisplayColorAttr().Get()) == 1
-    )
+    assert mesh.GetSubdivisionSchemeAttr().Get() == "none"
+    assert len(mesh.GetDisplayColorAttr().Get()) == 1
     assert mesh.GetNormalsInterpolation() == "vertex"
 
 
@@ -104,9 +96,8 @@ def test_several_bodies_are_a_mesh_each(result: Path, tmp_path: Path):
 def test_chosen_frames_keep_their_times(result: Path, tmp_path: Path):
     stage, (mesh,) = opened(export(result, tmp_path / "y.usda", frames=[1, 3, 4]))
     rate = stage.GetTimeCodesPerSecond()
-    assert np.array(mesh.GetPointsAttr().GetTimeSamples()) / rate == pytest.approx(
-        [0.01, 0.03, 0.04]
-    )
+    times = np.array(mesh.GetPointsAttr().GetTimeSamples()) / rate
+    assert times == pytest.approx([0.01, 0.03, 0.04])
     assert points_of(mesh, 0.03 * rate) == pytest.approx(surface(3), abs=1e-6)
     # a single frame
     assert frames_a_second(np.array([0.5])) == 1

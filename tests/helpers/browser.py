@@ -23,7 +23,10 @@ CHROMIUM = next(
     filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
 )
 in_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine")
-FLAGS = ("--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+FLAGS = (
+    "--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+    "--remote-debugging-pipe", "--hide-scrollbars",
+)  # fmt: skip
 # longest wait for an answer or a condition [s]
 PATIENCE = 30.0
 
@@ -36,14 +39,8 @@ class Browser:
         # pipes from the browser and to the browser
         ours, theirs = os.pipe(), os.pipe()
         read, write = (fcntl.fcntl(fd, fcntl.F_DUPFD, 20) for fd in (theirs[0], ours[1]))
-        profile = page.with_suffix(".profile")
-        words = [
-            str(CHROMIUM),
-            *FLAGS,
-            "--remote-debugging-pipe",
-            f"--user-data-dir={profile}",
-            "--hide-scrollbars",
-        ]
+        profile, url = page.with_suffix(".profile"), page.as_uri()
+        words = [str(CHROMIUM), *FLAGS, f"--user-data-dir={profile}"]
         # the browser reads file 3 and writes file 4
         shell = ["bash", "-c", f'exec "$@" 3<&{read} 4>&{write}', "bash"]
         self._process = subprocess.Popen(
@@ -52,19 +49,13 @@ class Browser:
         )  # fmt: skip
         for fd in (theirs[0], ours[1], read, write):
             os.close(fd)
-        self._from, self._to, self._rest, self._number, self._session = (
-            ours[0],
-            theirs[1],
-            b"",
-            0,
-            "",
-        )
+        self._from, self._to, self._rest = ours[0], theirs[1], b""
+        self._number, self._session = 0, ""
         window: dict[str, Any] = {"newWindow": True, "width": size[0], "height": size[1]}
         try:
-            target = self._ask("Target.createTarget", url=page.as_uri(), **window)
-            self._session = self._ask(
-                "Target.attachToTarget", targetId=target["targetId"], flatten=True
-            )["sessionId"]
+            target = self._ask("Target.createTarget", url=url, **window)
+            session = self._ask("Target.attachToTarget", targetId=target["targetId"], flatten=True)
+            self._session = session["sessionId"]
             self.until("document.documentElement?.dataset.ready === '1'")
         except BaseException:
             self.__exit__()
@@ -118,11 +109,13 @@ class Browser:
 
     def middle(self, selector: str) -> tuple[float, float]:
         """Return the position of the middle of an element [px]."""
-        box = f"document.querySelector({json.dumps(selector)}).getBoundingClientRect()"
-        x, y = self.value(
-            f"(({{ x, y, width, height }}) => [x + width / 2, y + height / 2])({box})"
-        )
-        return x, y
+        box = self._box(selector)
+        return box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+
+    def _box(self, selector: str) -> dict[str, float]:
+        """Return the corner, the width and the height of an element [px]."""
+        element = f"document.querySelector({json.dumps(selector)})"
+        return self.value(f"{element}.getBoundingClientRect().toJSON()")
 
     def _mouse(self, kind: str, x: float, y: float, **more: Any) -> None:
         self._ask("Input.dispatchMouseEvent", type=kind, x=x, y=y, **more)
@@ -134,9 +127,8 @@ class Browser:
         held: dict[str, Any] = {"button": "left", "modifiers": 8 if shift else 0}
         self._mouse("mousePressed", *start, buttons=1, clickCount=1, **held)
         for share in np.linspace(0.1, 1, 10):
-            self._mouse(
-                "mouseMoved", start[0] + share * by[0], start[1] + share * by[1], buttons=1, **held
-            )
+            x, y = start[0] + share * by[0], start[1] + share * by[1]
+            self._mouse("mouseMoved", x, y, buttons=1, **held)
         self._mouse("mouseReleased", start[0] + by[0], start[1] + by[1], clickCount=1, **held)
 
     def click(self, at: str | tuple[float, float]) -> None:
@@ -154,12 +146,9 @@ class Browser:
 
     def picture(self, selector: str = "#view") -> np.ndarray:
         """Return the picture (h, w, 3) of an element after the page has drawn."""
-        self.value(
-            "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
-        )
-        box = f"document.querySelector({json.dumps(selector)}).getBoundingClientRect()"
-        clip = self.value(
-            f"(({{ x, y, width, height }}) => ({{ x, y, width, height, scale: 1 }}))({box})"
-        )
+        drawn = "new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))"
+        self.value(drawn)
+        box = self._box(selector)
+        clip = {name: box[name] for name in ("x", "y", "width", "height")} | {"scale": 1}
         data = self._ask("Page.captureScreenshot", clip=clip)["data"]
         return np.array(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB")).astype(int)

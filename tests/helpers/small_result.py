@@ -44,11 +44,8 @@ def frame(index: int, **other) -> Frame:
     """Return frame ``index``, with ``other`` values in place of its own."""
     energies = dict(kinetic=1.0 * index, elastic=2.0 * index, potential=-1.0, contact=0.0)
     numbers = dict(step_error=1e-6, iterations=3, ksp_its=9, wall_time=0.1 * index)
-    arrays = dict(
-        position=position(index),
-        surface=POINTS + 0.01 * index * X,
-        momentum=np.array([1.0, 0, index]),
-    )
+    arrays = dict(position=position(index), surface=POINTS + 0.01 * index * X)
+    arrays |= dict(momentum=np.array([1.0, 0, index]))
     return Frame(**{"index": index, "time": DT * index, **energies, **numbers, **arrays, **other})
 
 
@@ -65,9 +62,8 @@ def write(
     arrays = dict(nodes=NODES, cells=cells(), springs=springs(), mass=np.full(len(NODES), 0.25))
     arrays |= dict(rest_length=np.full(s, H), stiffness=np.full(s, 100.0))
     arrays |= dict(pinned=np.array([0, 3]), cell_kind=np.ones(2, "u1"))
-    with ResultFile(
-        path, MPI.COMM_SELF, {"scene": SCENE, "ranks": 1, "command": "msmpetsc run bar.toml"}
-    ) as file:
+    origin = {"scene": SCENE, "ranks": 1, "command": "msmpetsc run bar.toml"}
+    with ResultFile(path, MPI.COMM_SELF, origin) as file:
         for name, rows in (arrays | lattice).items():
             file.write(f"lattice/{name}", rows)
         if surface:
@@ -76,14 +72,12 @@ def write(
             file.write("embedding/indptr", 8 * np.arange(len(POINTS) + 1))
             file.write("embedding/indices", cells()[[0, 1, 1, 0]].ravel())
             file.write("embedding/weights", np.full(8 * len(POINTS), 1 / 8))
-        also = {"surface": len(POINTS)} if surface else {}
-        also |= {
-            name: len(rows) for name in STRESS if (rows := getattr(frames[0], name)) is not None
-        }
+        optional = {name: getattr(frames[0], name) for name in STRESS}
+        also = {name: len(rows) for name, rows in optional.items() if rows is not None}
+        also |= {"surface": len(POINTS)} if surface else {}
         file.start_frames(len(frames), len((arrays | lattice)["nodes"]), also)
         for one in frames:
             file.append(one)
-            file.write_checkpoint(
-                Checkpoint(one.index, {"q": one.position, "q_previous": one.position - 1})
-            )
+            rows = {"q": one.position, "q_previous": one.position - 1}
+            file.write_checkpoint(Checkpoint(one.index, rows))
     return path

@@ -18,8 +18,6 @@ from msmpetsc.results.reader import Result
 
 # USD's tokens of the axes that may be upward
 UP = {1: UsdGeom.Tokens.y, 2: UsdGeom.Tokens.z}
-# frames between saves of a binary file [-]; bounds the memory
-SAVED = 16
 
 
 def write_usd(run: Result, frames: Sequence[int], path: Path) -> None:
@@ -49,11 +47,12 @@ def write_usd(run: Result, frames: Sequence[int], path: Path) -> None:
             UsdBody(stage, root.GetPath(), triangles, of_point, number)
             for number in np.unique(of_point)
         ]
-        for count, (frame, code) in enumerate(zip(frames, codes, strict=True), 1):
+        for frame, code in zip(frames, codes, strict=True):
             points = run.surface_at(frame) - middle
             for body in bodies:
                 body.add(points, float(code))
-            if path.suffix != ".usda" and count % SAVED == 0:
+            # a binary file grows frame by frame, a text is written at the end
+            if path.suffix != ".usda":
                 stage.Save()
         stage.Save()
     except Tf.ErrorException as error:

@@ -54,9 +54,8 @@ class Earlier:
         with Result(path) as result:
             if "frequencies" in result.attributes:
                 raise InputError(f"{path} has the modes of a body, no run to go on from")
-            texts = {
-                name: value for name, value in result.attributes.items() if isinstance(value, str)
-            }
+            attributes = result.attributes.items()
+            texts = {name: value for name, value in attributes if isinstance(value, str)}
             true_error = result.attributes.get("true_error")
             count = len(result.frames.time)
             planned = result.frames.time.planned[0]
@@ -111,12 +110,8 @@ def read_checkpoint(comm: MPI.Comm, path: Path, owned: int) -> Checkpoint | None
         if newest is None:
             return None
         slot, empty, names = newest
-        return replace(
-            empty,
-            rows={
-                name: _own_rows(comm, run, (f"checkpoint/{name}", slot), owned) for name in names
-            },
-        )
+        rows = {name: _own_rows(comm, run, (f"checkpoint/{name}", slot), owned) for name in names}
+        return replace(empty, rows=rows)
 
 
 def refuse_unlike_frame(path: Path, number: int) -> None:

@@ -81,21 +81,16 @@ class Layout:
         for name, about in sorted(FRAME_FIELDS.items(), key=lambda item: is_distributed(item[0])):
             if name not in counts and any(isinstance(size, str) for size in about.shape[1:]):
                 continue
-            shape = tuple(
-                size if isinstance(size, int) else counts[name] for size in about.shape[1:]
-            )
+            shape = (size if isinstance(size, int) else counts[name] for size in about.shape[1:])
+            whole = (self.frames, *shape)
             if is_distributed(name):
-                yield _rows_plan(f"frames/{name}", self.frames, shape[0], shape[1:], about.dtype)
+                yield _rows_plan(f"frames/{name}", *whole[:2], whole[2:], about.dtype)
             else:
-                yield Plan(
-                    f"frames/{name}", (self.frames, *shape), (self.frames, *shape), about.dtype
-                )
+                yield Plan(f"frames/{name}", whole, whole, about.dtype)
         yield Plan("checkpoint/step", (2,), (2,), FIELDS["checkpoint/step"].dtype)
         if self.numbers:
-            count = len(self.numbers)
-            yield Plan(
-                "checkpoint/numbers", (2, count), (1, count), FIELDS["checkpoint/numbers"].dtype
-            )
+            name, count = "checkpoint/numbers", len(self.numbers)
+            yield Plan(name, (2, count), (1, count), FIELDS[name].dtype)
         for name, shape in self.rows.items():
             yield _rows_plan(f"checkpoint/{name}", 2, self.nodes, shape, "f8")
 
@@ -121,11 +116,8 @@ class Layout:
         """Return the first dataset that a file lacks or has in another form; None if all fit."""
         for plan in self.plans():
             dataset = file.get(plan.name)
-            if (
-                dataset is None
-                or dataset.shape != plan.shape
-                or dataset.dtype != np.dtype(plan.dtype)
-            ):
+            wanted = plan.shape, np.dtype(plan.dtype)
+            if dataset is None or (dataset.shape, dataset.dtype) != wanted:
                 return plan.name
         names = file["checkpoint/numbers"].attrs["names"] if self.numbers else ""
         return None if names == " ".join(self.numbers) else "checkpoint/numbers"

@@ -165,14 +165,12 @@ class Result:
         self.file = open_result(path)
         try:
             with plain_damage(self.path):
-                self.attributes = {
-                    name: as_python(value) for name, value in self.file.attrs.items()
-                }
+                attributes = self.file.attrs.items()
+                self.attributes = {name: as_python(value) for name, value in attributes}
                 rows = {"frames": finished(self.file)}
-                datasets = checked_datasets(self.file).items()
                 self._datasets = {
                     name: LazyArray(data, rows.get(name.partition("/")[0]))
-                    for name, data in datasets
+                    for name, data in checked_datasets(self.file).items()
                 }
         except BaseException:
             self.close()

@@ -1,14 +1,11 @@
 """Write the result file (HDF5, format_version 1): a single file of all ranks, safe against a kill.
 
-All metadata is on disk before the first frame and does not change while frames are written
-(results.layout). The data of a frame are written before its time. ``/frames/time`` starts as NaN,
-so a frame is finished if its time is finite (`finished`). The checkpoint has two slots. A new
-checkpoint overwrites the older slot, whose step is -1 meanwhile. So the other slot always holds a
-complete checkpoint.
+results.layout creates all metadata before the first frame. The data of a frame are written before
+its time, and a frame is finished if its time is finite. A new checkpoint overwrites the older of
+two slots, whose step is -1 meanwhile, so the other slot always holds a complete checkpoint.
 
-A resumed run writes into the existing file if all datasets that it needs are laid out there, so
-that the metadata does not change. Otherwise it writes a new file, copies the frames to it, and
-renames it when they are complete (`Begin`).
+A resumed run writes into the existing file if all datasets that it needs are laid out there.
+Otherwise it writes a new file, copies the frames to it, and renames it (`Begin`).
 """
 
 import os
@@ -211,13 +208,8 @@ class ResultFile:
         """Store the next frame (collective). After the return a kill cannot lose it."""
         index = self.finished
         for name, counts in self._rows.items():
-            self._collect(
-                getattr(frame, name),
-                np.dtype(FRAME_FIELDS[name].dtype),
-                counts,
-                f"frames/{name}",
-                index,
-            )
+            dtype = np.dtype(FRAME_FIELDS[name].dtype)
+            self._collect(getattr(frame, name), dtype, counts, f"frames/{name}", index)
         with self._together():
             if self._file is not None and self._storage is not None:
                 self._flush(self._file)
@@ -236,16 +228,14 @@ class ResultFile:
                 self._file["checkpoint/step"][slot] = -1
                 self._flush(self._file)
         slot = self._comm.bcast(slot)
+        counts = self._rows["position"]
         for name, values in saved.rows.items():
-            self._collect(
-                values, np.dtype("f8"), self._rows["position"], f"checkpoint/{name}", slot
-            )
+            self._collect(values, np.dtype("f8"), counts, f"checkpoint/{name}", slot)
         with self._together():
             if self._file is not None:
                 if saved.numbers:
-                    self._file["checkpoint/numbers"][slot] = [
-                        float(value) for value in saved.numbers.values()
-                    ]
+                    numbers = [float(value) for value in saved.numbers.values()]
+                    self._file["checkpoint/numbers"][slot] = numbers
                 self._flush(self._file)
                 self._file["checkpoint/step"][slot] = saved.step
                 self._flush(self._file)
@@ -274,9 +264,8 @@ class ResultFile:
             else:
                 self._storage = Storage(self._part, "w+")
                 self._file = open_to_write(self._storage, "w")
-                self._file.attrs.update(
-                    attributes | {"format": FORMAT, "format_version": FORMAT_VERSION}
-                )
+                own = {"format": FORMAT, "format_version": FORMAT_VERSION}
+                self._file.attrs.update(attributes | own)
                 self._temporary[self._part] = self._part.stat().st_ino
             opened.callback(self._storage.close)
             self._temporary[lock.path] = lock.inode
@@ -315,15 +304,12 @@ class ResultFile:
     def _copy_frames(self, file: h5py.File) -> None:
         """Copy the finished frames of the earlier file, up to the limit of `keep`."""
         with Result(self.path) as earlier:
-            datasets = {
-                name: file["frames"][name] for name in earlier.frames if name in file["frames"]
-            }
+            known = [name for name in earlier.frames if name in file["frames"]]
+            datasets = {name: file["frames"][name] for name in known}
             for name, dataset in datasets.items():
-                if dataset.shape[1:] != earlier.frames[name].shape[1:]:
-                    raise InputError(
-                        f"{self.path} is damaged: frames/{name} has shape "
-                        f"{earlier.frames[name].shape}"
-                    )
+                shape = earlier.frames[name].shape
+                if dataset.shape[1:] != shape[1:]:
+                    raise InputError(f"{self.path} is damaged: frames/{name} has shape {shape}")
             count = len(earlier.frames.time)
             if self._most_copied is not None:
                 count = min(self._most_copied, count)

@@ -5,6 +5,7 @@ The layout is in report.html.j2; this module computes the values that the templa
 
 import tomllib
 from datetime import datetime
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -37,19 +38,12 @@ def write_report(folder: Path) -> Path:
     table = read_table(folder)
     file = folder / "study.toml"
     study = tomllib.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
-    styles = curve_styles(table["label"])
-    sweeps = swept(table)
-    charts = [
-        *stability_charts(table, study),
-        *size_charts(sweeps, styles),
-        *pareto_charts(sweeps, styles),
-        *profile_charts(sweeps, styles),
-        *growth_charts(sweeps),
-    ]
+    sweeps, styles = swept(table), curve_styles(table["label"])
+    of_methods = (draw(sweeps, styles) for draw in (size_charts, pareto_charts, profile_charts))
+    charts = [*stability_charts(table, study), *chain(*of_methods), *growth_charts(sweeps)]
     for chart in charts:
         save_png(chart, folder)
-    names = [name for name in table["study"] if name]
-    title = str(study.get("title") or next(iter(names), "") or folder.resolve().name)
+    title = str(study.get("title") or folder.resolve().name)
     written = datetime.fromtimestamp((folder / "table.csv").stat().st_mtime).astimezone()
     write_whole(folder / "report.html", page(title, f"{written:%d %B %Y, %H:%M %z}", table, charts))
     return folder / "report.html"
@@ -74,13 +68,9 @@ def page(title: str, date: str, table: DataFrame, charts: list[Chart]) -> str:
 def facts(table: DataFrame) -> dict[str, Any]:
     """Return the template's values: machines, versions, numbers of cases and of repeats."""
     plain = swept(table)
-    maps = {
-        name: f"{len(group)}: {counted(group['outcome'])}" for name, group in mapped(table).items()
-    }
-    platforms = {
-        name.capitalize(): [text for text in table[name].unique() if text]
-        for name in ("machine", "versions")
-    }
+    maps = {name: f"{len(of)}: {counted(of['outcome'])}" for name, of in mapped(table).items()}
+    texts = {name: filter(None, table[name].unique()) for name in ("machine", "versions")}
+    platforms = {name.capitalize(): [*of] for name, of in texts.items()}
     counts = {"cases": len(plain), "failed": len(failed(plain)), "empty": table.empty}
     repeats = sorted(set(succeeded(plain)["repeats"].fillna(1).astype(int)))
     # empty if no case succeeded
@@ -91,7 +81,6 @@ def facts(table: DataFrame) -> dict[str, Any]:
 
 def html(table: DataFrame) -> Markup:
     """Return a table as HTML; a click on a column's heading sorts it."""
+    plain = table.map(formatting.plain)
     with option_context("display.max_colwidth", None):
-        return Markup(
-            table.map(formatting.plain).to_html(index=False, border=0, classes="sortable")
-        )
+        return Markup(plain.to_html(index=False, border=0, classes="sortable"))

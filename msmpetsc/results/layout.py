@@ -81,10 +81,10 @@ class Layout:
         for name, about in sorted(FRAME_FIELDS.items(), key=lambda item: is_distributed(item[0])):
             if name not in counts and any(isinstance(size, str) for size in about.shape[1:]):
                 continue
-            shape = (size if isinstance(size, int) else counts[name] for size in about.shape[1:])
-            whole = (self.frames, *shape)
+            sizes = (size if isinstance(size, int) else counts[name] for size in about.shape[1:])
+            whole = (self.frames, *sizes)
             if is_distributed(name):
-                yield _rows_plan(f"frames/{name}", *whole[:2], whole[2:], about.dtype)
+                yield _rows_plan(f"frames/{name}", whole[0], whole[1], whole[2:], about.dtype)
             else:
                 yield Plan(f"frames/{name}", whole, whole, about.dtype)
         yield Plan("checkpoint/step", (2,), (2,), FIELDS["checkpoint/step"].dtype)

@@ -79,9 +79,8 @@ def plain_damage(path: Path) -> Iterator[None]:
     except PermissionError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from error
     except KeyError as error:
-        raise InputError(
-            f"{path} is damaged: it has no {printable(str(error.args[0]), 40)}"
-        ) from error
+        missing = printable(str(error.args[0]), 40)
+        raise InputError(f"{path} is damaged: it has no {missing}") from error
     except (
         OSError,
         RuntimeError,

@@ -333,8 +333,8 @@ def map_points(map: Map) -> Iterator[tuple[float | None, float | str, MapCase]]:
     if map.x and map.y and map.file:
         for y, x in product(map.y.values, map.x.values):
             changes = (*map.set, *axis_changes(map.x, x, map), *axis_changes(map.y, y, map))
-            length = {"steps": map.steps, "duration": map.duration}
-            yield x, y, MapCase(name=map.name, file=map.file, set=changes, **length)
+            base = MapCase(name=map.name, file=map.file, steps=map.steps, set=changes)
+            yield x, y, base.model_copy(update={"duration": map.duration})
 
 
 def axis_changes(axis: Axis, value: float, length: Length) -> Iterator[str]:

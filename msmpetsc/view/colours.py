@@ -115,12 +115,11 @@ def colouring_of(subject: Drawable, name: str | None) -> Colouring:
 def _displacement(subject: Drawable) -> Colouring:
     """Return the field of distances [m] of the points from their rest positions."""
     rest = subject.rest.points
-    return Colouring(
-        "displacement",
-        "m",
-        lambda index: np.linalg.norm(subject.surface(index) - rest, axis=1),
-        natural=abs(rest).max(),
-    )
+
+    def values(index: int) -> Floats:
+        return np.asarray(np.linalg.norm(subject.surface(index) - rest, axis=1))
+
+    return Colouring("displacement", "m", values, natural=abs(rest).max())
 
 
 def _speed(subject: Drawable) -> Colouring:
@@ -131,17 +130,12 @@ def _speed(subject: Drawable) -> Colouring:
         before, after = max(index - 1, 0), min(index + 1, last)
         if before == after:
             return np.zeros(len(subject.rest.points))
-        velocity = (subject.surface(after) - subject.surface(before)) / (
-            subject.times[after] - subject.times[before]
-        )
-        return np.asarray(np.linalg.norm(velocity, axis=1))
+        way = subject.surface(after) - subject.surface(before)
+        duration = subject.times[after] - subject.times[before]
+        return np.asarray(np.linalg.norm(way, axis=1) / duration)
 
-    return Colouring(
-        "speed",
-        "m/s",
-        values,
-        natural=abs(subject.rest.points).max() / (np.ptp(subject.times) or 1.0),
-    )
+    natural = abs(subject.rest.points).max() / (np.ptp(subject.times) or 1.0)
+    return Colouring("speed", "m/s", values, natural=natural)
 
 
 def _strain(subject: Drawable) -> Colouring:
@@ -154,9 +148,8 @@ def _strain(subject: Drawable) -> Colouring:
         nodes = subject.nodes(index)
         length = np.linalg.norm(nodes[springs[:, 0]] - nodes[springs[:, 1]], axis=1)
         squares = np.repeat((length / rest_length - 1) ** 2, 2)
-        return subject.on_surface(
-            np.sqrt(np.bincount(springs.ravel(), squares, len(nodes)) / count)
-        )
+        sums = np.bincount(springs.ravel(), squares, len(nodes))
+        return subject.on_surface(np.sqrt(sums / count))
 
     return Colouring("strain of the springs", "%", values, natural=1.0)
 
@@ -165,14 +158,10 @@ def _stress(subject: Drawable) -> Colouring:
     """Return the field of von Mises stresses [Pa] of the nodes, interpolated to the surface."""
     von_mises = subject.von_mises
     if von_mises is None:
+        why = "stores no stress: run its scene with output.stress = true"
         if subject.scene.material.poisson is None:
-            raise InputError(
-                f"--colour stress: {subject.name} is of springs, whose law has no stress"
-            )
-        raise InputError(
-            f"--colour stress: {subject.name} stores no stress: "
-            "run its scene with output.stress = true"
-        )
+            why = "is of springs, whose law has no stress"
+        raise InputError(f"--colour stress: {subject.name} {why}")
     young = subject.scene.material.young_modulus or 0.0
     return Colouring(
         "von Mises' stress", "Pa", lambda index: subject.on_surface(von_mises(index)), natural=young
@@ -192,12 +181,9 @@ def _part(subject: Drawable) -> Colouring:
 
 
 COLOURINGS: dict[str, Callable[[Drawable], Colouring]] = {
-    "displacement": _displacement,
-    "speed": _speed,
-    "strain": _strain,
-    "stress": _stress,
+    "displacement": _displacement, "speed": _speed, "strain": _strain, "stress": _stress,
     "part": _part,
-}
+}  # fmt: skip
 
 
 def scaled(colouring: Colouring, subject: Drawable, frames: Iterable[int]) -> Colouring:

@@ -164,6 +164,10 @@ def drawable_of_result(run: Result) -> Drawable:
     pinned = np.zeros(len(nodes), bool)
     if "lattice/pinned" in run:
         pinned[run.indices("lattice/pinned")] = True
+
+    def von_mises(index: int) -> Floats:
+        return run.frames.von_mises[index].astype(float)
+
     return Drawable(
         name=str(run.path),
         scene=scene,
@@ -175,9 +179,7 @@ def drawable_of_result(run: Result) -> Drawable:
         embedding=run.embedding,
         array=lambda name: run.indices(name) if name == "lattice/springs" else run[name][:],
         solids=solids_of(run),
-        von_mises=(lambda index: run.frames.von_mises[index].astype(float))
-        if "von_mises" in run.frames
-        else None,
+        von_mises=von_mises if "von_mises" in run.frames else None,
         frequencies=np.ravel(run.attributes.get("frequencies", [])),
     )
 

@@ -115,9 +115,8 @@ def solid_facts(surface: Surface) -> dict[str, Floats]:
 
 def page_text(title: str, facts: dict[str, Any], streams: dict[str, bytes]) -> str:
     """Return the text of the page, which loads no other file."""
-    data = facts | {
-        "streams": {name: base64.b64encode(stream).decode() for name, stream in streams.items()}
-    }
+    coded = {name: base64.b64encode(stream).decode() for name, stream in streams.items()}
+    data = facts | {"streams": coded}
     text = json.dumps(data, separators=(",", ":"), default=np.ndarray.tolist)
     parts = {
         "title": html.escape(title),

@@ -114,9 +114,12 @@ class Renderer(AbstractContextManager["Renderer"]):
             )
         for ball in overlays.balls:
             sphere = pv.Sphere(
-                radius=ball.radius, center=ball.center, theta_resolution=96, phi_resolution=96
+                radius=ball.radius,
+                center=ball.center.tolist(),
+                theta_resolution=96,
+                phi_resolution=96,
             )
-            shading = dict(smooth_shading=True, ambient=0.6, diffuse=0.4)
+            shading: dict[str, Any] = dict(smooth_shading=True, ambient=0.6, diffuse=0.4)
             self._plotter.add_mesh(sphere, color=GLASS, opacity=GLASS_OPACITY, **shading)
         for obstacle in overlays.meshes:
             solid = self._composition.subject.solids[obstacle.number]

@@ -48,12 +48,9 @@ def contact_sheet(
         subject = drawable_of_result(run)
         chosen = _moments(run, subject, frames, count)
         composition = composition_of(drawn(subject), list(chosen), style)
-        stills = zip(composition.stills(list(chosen)), chosen.values(), strict=True)
-        draw_panels(
-            composition,
-            [replace(still, caption=(still.caption[0], text)) for still, text in stills],
-            png_path,
-        )
+        pairs = zip(composition.stills(list(chosen)), chosen.values(), strict=True)
+        stills = [replace(still, caption=(still.caption[0], text)) for still, text in pairs]
+        draw_panels(composition, stills, png_path)
     return Path(png_path)
 
 
@@ -65,9 +62,7 @@ def draw_panels(composition: Composition, stills: Sequence[Still], path: str | P
     low, high, _ = composition.room(stills)
     # [px/m]
     scale = ((composition.style.size or PANEL) / (high - low)).min()
-    width, height = (
-        int(side) for side in np.maximum([NARROWEST, 1], np.round(scale * (high - low)))
-    )
+    width, height = np.maximum([NARROWEST, 1], np.rint(scale * (high - low)).astype(int)).tolist()
     rows = -(-len(stills) // max(1, ROW // width))
     columns = -(-len(stills) // rows)
     sheet = np.full((rows, height + CAPTION, columns, width, 3), 255, np.uint8)
@@ -77,10 +72,9 @@ def draw_panels(composition: Composition, stills: Sequence[Still], path: str | P
             sheet[number // columns, :, number % columns] = np.concatenate(captioned)
     sheet = sheet.reshape(rows * (height + CAPTION), columns * width, 3)
     entries = entries_of(composition, stills)
+    legend = legend_picture(entries, columns * width)
     with whole_file(Path(path)) as part:
-        Image.fromarray(np.concatenate([sheet, legend_picture(entries, columns * width)])).save(
-            part
-        )
+        Image.fromarray(np.concatenate([sheet, legend])).save(part)
 
 
 def _moments(
@@ -91,10 +85,8 @@ def _moments(
         return dict.fromkeys(frames_of(subject.name, frames, len(subject.times)), "")
     if count is not None or not subject.scene.picture.times:
         return choose_moments(run, count or COUNT)
-    nearest = {
-        0,
-        *(int(np.argmin(abs(subject.times - wanted))) for wanted in subject.scene.picture.times),
-    }
+    wanted = np.array(subject.scene.picture.times)[:, None]
+    nearest = {0, *abs(subject.times - wanted).argmin(axis=1).tolist()}
     return {index: "" if index else "start" for index in sorted(nearest)}
 
 
@@ -105,19 +97,13 @@ def choose_moments(run: Result, count: int) -> dict[int, str]:
     greatest kinetic energy before it (contact of a falling body) and the greatest potential energy
     after it (top of the bounce). Remaining frames halve the longest gaps between chosen frames.
     """
-    kinetic, elastic, potential = (
-        run.frames[name][:] for name in ("kinetic", "elastic", "potential")
-    )
-    total = len(elastic)
-    most_elastic = int(np.argmax(elastic))
-    fastest = int(np.argmax(kinetic[: most_elastic + 1]))
-    highest = most_elastic + int(np.argmax(potential[most_elastic:]))
+    total = len(run.frames)
+    most_elastic = int(run.frames.elastic[:].argmax())
+    fastest = int(run.frames.kinetic[: most_elastic + 1].argmax())
+    highest = most_elastic + int(run.frames.potential[most_elastic:].argmax())
     moments = {0: "start", total - 1: "end"}
-    for index, reason in (
-        (most_elastic, "most elastic energy"),
-        (fastest, "fastest"),
-        (highest, "highest"),
-    ):
+    reasons = (most_elastic, "most elastic energy"), (fastest, "fastest"), (highest, "highest")
+    for index, reason in reasons:
         if len(moments) < count:
             moments.setdefault(index, reason)
     while len(moments) < min(count, total):

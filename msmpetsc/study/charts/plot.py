@@ -149,9 +149,8 @@ class Axes:
     def rings(self, rows: DataFrame, columns: Columns) -> None:
         """Draw a ring around each row."""
         values = [{"x": x, "y": y} for x, y in rows[list(columns)].itertuples(index=False)]
-        self.draw(
-            values, {"type": "point", "shape": RING, "size": 240, "fill": INK, "strokeWidth": 0}
-        )
+        mark = {"type": "point", "shape": RING, "size": 240, "fill": INK, "strokeWidth": 0}
+        self.draw(values, mark)
 
 
 def points(rows: DataFrame, columns: Columns, names: Iterable[str]) -> list[dict[str, Any]]:
@@ -233,8 +232,5 @@ def save_png(chart: Chart, folder: Path) -> None:
 def svg_text(chart: Chart) -> str:
     """Return a chart as an <svg> element; browsers show the <title> of a point as its tooltip."""
     text = vl_convert.vegalite_to_svg({"config": CONFIG} | chart.spec())
-    return re.sub(
-        r'<path aria-label="([^"]*)"([^>]*)/>',
-        r'<path class="point"\2><title>\1</title></path>',
-        text,
-    )
+    point = re.compile(r'<path aria-label="([^"]*)"([^>]*)/>')
+    return point.sub(r'<path class="point"\2><title>\1</title></path>', text)

@@ -75,12 +75,10 @@ def stability_chart(name: str, rows: DataFrame, settings: dict[str, Any]) -> Cha
     """Return the chart of a map; ``settings`` is the map's table in the study file."""
     x, y = (scale(rows, column, settings.get(column, {})) for column in ("x", "y"))
     rows = rows[rows["outcome"].isin(OUTCOMES)].drop_duplicates(["label", "x", "y"], keep="last")
+    shown = [outcome for outcome in reversed(OUTCOMES) if outcome in set(rows["outcome"])]
     legend = {
-        f"{SYMBOLS.get(outcome, '12')}  {outcome}: {MEANING[outcome]}": CurveStyle(
-            COLORS[outcome], "square"
-        )
-        for outcome in reversed(OUTCOMES)
-        if outcome in set(rows["outcome"])
+        f"{SYMBOLS.get(each, '12')}  {each}: {MEANING[each]}": CurveStyle(COLORS[each], "square")
+        for each in shown
     }
     title = settings.get("title") or name
     chart = Chart(f"stability_{name}", "Stability", title, CAPTION, legend, COLUMNS, gap=35)
@@ -104,14 +102,9 @@ def stability_chart(name: str, rows: DataFrame, settings: dict[str, Any]) -> Cha
 
 def axis(scale: Scale, title: str = "", **axis: Any) -> dict[str, Any]:
     """Return an axis with a cell for each value."""
-    values = list(scale.texts.values())
+    cells = {"domain": list(scale.texts.values()), "padding": 0.06}
     plain = {"domain": False, "ticks": False}
-    return {
-        "type": "ordinal",
-        "title": title,
-        "scale": {"domain": values, "padding": 0.06},
-        "axis": plain | axis,
-    }
+    return {"type": "ordinal", "title": title, "scale": cells, "axis": plain | axis}
 
 
 def draw_cells(panel: Axes, rows: DataFrame, x: Scale, y: Scale) -> None:

@@ -31,10 +31,8 @@ def test_figures_are_of_all_frames_but_the_first_and_of_the_median_repeat():
     row = bench.row("heart_pull", {"old": [sample([9.0, 1.8])], "failed": [], "new": repeats})
     assert row["new [ms]"] == "600 (300 to 1,200)" and row["failed [ms]"] is None
     assert row["times as fast"] == pytest.approx(3) and row["products"] == "60 / - / 60"
-    assert (
-        row["slowest tenth [ms]"] == pytest.approx(1200)
-        and row["frames/s (paper's CPU, GPU)"] == "1.67 (19.9, 53.4)"
-    )
+    assert row["slowest tenth [ms]"] == pytest.approx(1200)
+    assert row["frames/s (paper's CPU, GPU)"] == "1.67 (19.9, 53.4)"
     assert (row["proof"], row["coarse"]) == ("10.0%", "25.0%")
     assert (row["us a cell"], row["kB a node"], row["error"]) == pytest.approx((600, 2, 1e-4))
 
@@ -43,11 +41,8 @@ def test_a_run_is_a_real_one(tmp_path: Path, monkeypatch):
     monkeypatch.setattr(lab, "OUT", tmp_path)
     monkeypatch.setattr(bench, "BEAMS", {"beam 1e4": (8, 5e5, 2)})
     done = bench.measured("beam 1e4", bench.METHODS["newton, gamg"], None)
-    assert (
-        len(done.frames["ksp_its"]) == 2
-        and done.frames["products"].min() > 0
-        and done.cost["cells"] == 8 * 3 * 3
-    )
+    assert len(done.frames["ksp_its"]) == 2 and done.frames["products"].min() > 0
+    assert done.cost["cells"] == 8 * 3 * 3
     assert bench.measured("beam 1e4", bench.Method(("-gone",)), None) is None
 
 

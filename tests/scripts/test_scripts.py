@@ -17,21 +17,15 @@ SCRIPTS = sorted(
     path.stem for path in (ROOT / "scripts").glob("*.py") if path.stem not in ("clone", "lab")
 )
 # no environment is activated
-HOME = {
-    "PATH": "/usr/local/bin:/usr/bin:/bin",
-    "HOME": "/nonexistent",
-    **AS_ROOT,
-}
+HOME = {"PATH": "/usr/local/bin:/usr/bin:/bin", "HOME": "/nonexistent", **AS_ROOT}
 # the Python that made the clone's .venv
 SYSTEM_PYTHON = sys._base_executable
 
 
 @pytest.mark.skipif(not (ROOT / ".venv").exists(), reason="the clone has no .venv")
 def test_a_script_finds_its_python():
-    script = ROOT / "scripts" / "house.py"
-    done = subprocess.run(
-        [SYSTEM_PYTHON, script, "--help"], env=HOME, capture_output=True, text=True
-    )
+    command = [SYSTEM_PYTHON, ROOT / "scripts" / "house.py", "--help"]
+    done = subprocess.run(command, env=HOME, capture_output=True, text=True)
     assert done.returncode == 0 and done.stdout.startswith("usage: "), done.stderr
 
 
@@ -86,15 +80,11 @@ def clone(tmp_path: Path) -> Path:
 
 
 def set_up(clone: Path, *extras: str, **variables: str) -> subprocess.CompletedProcess:
-    environment = {
-        "PATH": f"{clone / 'bin'}:{os.environ['PATH']}",
-        "PYTHON": str(clone / "bin" / "python"),
-        **variables,
-    }
+    path = f"{clone / 'bin'}:{os.environ['PATH']}"
+    environment = {"PATH": path, "PYTHON": str(clone / "bin" / "python"), **variables}
     command = [clone / "scripts" / "setup", *extras]
-    return subprocess.run(
-        command, env=environment, stdin=subprocess.DEVNULL, capture_output=True, text=True
-    )
+    quiet = dict(stdin=subprocess.DEVNULL, capture_output=True, text=True)
+    return subprocess.run(command, env=environment, **quiet)
 
 
 def test_pip_is_silent_and_not_asked_twice(clone: Path):
@@ -182,11 +172,8 @@ def test_who_may_not_install_is_told_what_to_ask_for(bare: Path, tmp_path: Path)
 def test_a_folder_of_others_is_left_alone(bare: Path, tmp_path: Path) -> None:
     (tmp_path / "mine").write_text("keep")
     done = build(bare, tmp_path, "--arch", "90")
-    assert (
-        done.returncode == 2
-        and "holds something else" in done.stderr
-        and (tmp_path / "mine").exists()
-    )
+    assert done.returncode == 2 and "holds something else" in done.stderr
+    assert (tmp_path / "mine").exists()
 
 
 def test_what_is_made_is_not_made_again(bare: Path, tmp_path: Path) -> None:

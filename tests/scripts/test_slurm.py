@@ -64,18 +64,11 @@ class Job:
 
     def start(self) -> subprocess.Popen:
         """Start the script as Slurm does, for the first time or again."""
-        array = {
-            "SLURM_ARRAY_JOB_ID": "70",
-            "SLURM_ARRAY_TASK_ID": "3",
-            "SLURM_ARRAY_TASK_MAX": "16",
-        }
-        environment = {**os.environ, **AS_ROOT, "SLURM_JOB_ID": "77", **array}
-        environment = {
-            name: value
-            for name, value in environment.items()
-            if not name.startswith(("OMPI_COMM", "PMIX"))
-        }
-        environment.pop("OMP_NUM_THREADS", None)
+        ids = {"JOB_ID": 77, "ARRAY_JOB_ID": 70, "ARRAY_TASK_ID": 3, "ARRAY_TASK_MAX": 16}
+        slurm = {f"SLURM_{name}": str(number) for name, number in ids.items()}
+        foreign = ("OMPI_COMM", "PMIX", "OMP_NUM_THREADS")
+        own = {name: value for name, value in os.environ.items() if not name.startswith(foreign)}
+        environment = {**own, **AS_ROOT, **slurm}
         return subprocess.Popen(
             ["bash", self.script], cwd=self.folder, env=environment, text=True,
             stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
@@ -135,8 +128,7 @@ def test_what_fails_is_not_queued_again(script: Path, tmp_path: Path):
 def test_a_task_of_an_array_is_queued_again_until_its_part_is_done(tmp_path: Path):
     job = Job(SCRIPTS[0], tmp_path)
     assert "queued again" in job.stopped(1)
-    assert job.told() == ["study growth.toml --part 3/16 threads=1"] and job.requeued == [
-        "requeue 70_3"
-    ]
+    assert job.told() == ["study growth.toml --part 3/16 threads=1"]
+    assert job.requeued == ["requeue 70_3"]
     (tmp_path / "done").write_text("0")
     assert job.status() == 0 and job.requeued == ["requeue 70_3"]

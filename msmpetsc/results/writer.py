@@ -101,8 +101,8 @@ class ResultFile:
         # the file and its storage, on rank 0 only
         self._file: h5py.File | None = None
         self._storage: Storage | None = None
-        # type and first byte of each field of frames that is not distributed, on rank 0; time
-        # is the last; set by start_frames
+        # type and first byte of fields of frames that are not distributed, on rank 0,
+        # time last; set by start_frames
         self._numbers: dict[str, tuple[np.dtype[Any], int]] = {}
         # descriptor of the file on each rank, set by start_frames if all ranks reach it
         self._descriptor: int | None = None

@@ -10,12 +10,8 @@ Adjacent half kicks are merged, except at the ends of a step, so that a frame ha
 same time. A kick has the mean of f_ext over its duration. The method is stable if dt < 2 / omega,
 with omega^2 the largest eigenvalue of M^(-1) (Hessian of E).
 
-This limit holds for small oscillations only (scripts/docs/pages/integrators.md). In large
-oscillations the energy gains the error of the trapezoidal rule for the work of the springs,
-
-    E(q_N) - E(q_0) - sum_n 1/2 (grad E(q_n) + grad E(q_(n+1))) . (q_(n+1) - q_n)
-
-which is zero for a quadratic E. A step that gains too much is repeated with twice the substeps.
+This limit holds for small oscillations only (scripts/docs/pages/integrators.md). A step that raises
+omega beyond it is repeated with shorter substeps.
 """
 
 import sys
@@ -27,7 +23,7 @@ from mpi4py import MPI
 
 from msmpetsc.backend.arrays import Floats, Mask, Positions, Rows, greatest
 from msmpetsc.backend.kernel import kernel
-from msmpetsc.checkpoint import FINITE, Checkpoint, Range
+from msmpetsc.checkpoint import Checkpoint, Range
 from msmpetsc.comm import log, reduced
 from msmpetsc.contact.obstacles.node_friction import Movers
 from msmpetsc.contact.obstacles.reflection import StepTaken
@@ -38,7 +34,6 @@ from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
-from msmpetsc.solve.energy_balance import OSCILLATION_CREDIT
 from msmpetsc.solve.integrators.integrator import Integrator, State
 from msmpetsc.solve.integrators.mass_damping import decay
 from msmpetsc.solve.linear.ghosts import Ghosted
@@ -50,19 +45,8 @@ from msmpetsc.solve.work import Work
 SAFETY = 0.8
 # greatest number of repetitions of a step; bounds the cost of an unstable step
 RETRIES = 4
-# spurious energy above which the substep length is halved [all energy]; a fifth of
-# NOTABLE_GAIN
-GAIN = 2e-3
-# gain below which the substep length doubles [limit of the gain]; substeps twice as
-# long gain 4 to 16 times as much
-EASED = 1 / 32
-# greatest number of halvings of the substep length; 32 times as many substeps bound the
-# cost
-HALVINGS = 5
 # greatest number of substeps in a step; more would take hours
 MOST_SUBSTEPS = 1e6
-# spurious energy that rounding may cause [least energy of an unstable body]
-ROUNDING = 1e-14
 # least elastic energy of an unstable body [energy that crushes all springs]; no load
 # reaches it
 UNSTABLE = 100.0
@@ -71,23 +55,14 @@ UNSTABLE = 100.0
 class Verlet(Integrator):
     """Take steps by the velocity Verlet method; ``time.substep`` may only shorten its substeps.
 
-    gradient     : (l, 3) grad E [N], contact included
-    elastic      : (owned, 3) grad E [N] without contact
-    contact      : contact at the present positions; None without contact
-    work         : work [J] of obstacles, loads and anchors on this rank's nodes in a step
-    springs_work : work [J] that the springs of this rank's nodes absorb in a step
-    gained       : spurious energy [J] of the springs so far, less its dissipation; negative for a
-                   credit
-    halvings     : number of halvings of the substep length because of spurious energy
-    end          : end time of the step [s]
-    known        : positions (l, 3) [m] of ``gradient`` and of the highest frequency
+    gradient : (l, 3) grad E [N], contact included
+    contact  : contact at the present positions; None without contact
+    work     : work [J] of obstacles, loads and anchors on this rank's nodes in a step
+    end      : end time of the step [s]
+    known    : positions (l, 3) [m] of ``gradient`` and of the highest frequency
     """
 
-    state: ClassVar[dict[str, Range]] = {
-        "substep": (sys.float_info.min, np.inf),
-        "halvings": (0, HALVINGS),
-        "gained": FINITE,
-    }
+    state: ClassVar[dict[str, Range]] = {"substep": (sys.float_info.min, np.inf)}
 
     def __init__(
         self, comm: MPI.Comm, environment: Environment, time: Time, _: Solver, _prefix: str
@@ -103,14 +78,11 @@ class Verlet(Integrator):
         owned = self.lattice.owned
         self.q, self.v = self.position.values[:owned], self.velocity.values[:owned]
         self.gradient, self.per_mass = np.zeros_like(self.lattice.nodes), 1 / self.lattice.mass
-        self.elastic = self.gradient[:owned]
         self.contact: StepContactAt | None = None
         self.sides = environment.obstacles.no_sides[:, :owned]
         self.load = np.zeros((owned, 3), like=self.lattice.nodes)
         self.damping = environment.damping
-        self.work = self.springs_work = self.gained = 0.0
-        self.halvings = 0
-        self.end = 0.0
+        self.work = self.end = 0.0
         self.known: Floats | None = None
         self.anchors: int | None = None
         self._fix(environment.anchors.fixed_at(self.time_step)[:owned])
@@ -125,13 +97,12 @@ class Verlet(Integrator):
 
     def forget(self) -> None:
         self.known = self.anchors = None
-        self.gained, self.halvings = 0.0, 0
 
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         """Take the step that ends at ``time`` [s] (collective). Raises StepFailed.
 
-        If the end of the step shows that the substeps were too long, the step is repeated with
-        shorter substeps: an impact may stiffen the body, and folded cells may gain spurious energy.
+        If an impact has stiffened the body so that the substeps were too long, the step is repeated
+        with shorter substeps.
         """
         start, self.end = time - self.time_step, time
         self.environment.forces.begin_step(state.q, state.velocity(self.time_step), start)
@@ -140,8 +111,8 @@ class Verlet(Integrator):
         squared = contact_bound + (
             self.highest.squared or self.highest.squared_at(self.position.values)
         )
-        for retry in range(1 + RETRIES):
-            count = self._count(squared) * 2**self.halvings
+        for _ in range(1 + RETRIES):
+            count = self._count(squared)
             dt = self.time_step / count
             self.load = self._mean_load(start, start + 0.5 * dt)
             squared_start = self._squared_acceleration()
@@ -152,13 +123,11 @@ class Verlet(Integrator):
             after = np.inf
             if energy <= self.unstable_energy:
                 after = contact_bound + self.highest.squared_at(self.position.values)
-            is_stable = dt**2 * after <= 4
-            if is_stable and (not self._is_to_halve(state.q, energy) or retry == RETRIES):
+            if dt**2 * after <= 4:
                 return self._result(
                     count, dt**2 / 8 * (self._squared_acceleration() - squared_start)
                 )
-            if not is_stable:
-                squared = np.clip(after, 2 * squared, 16 * squared)
+            squared = np.clip(after, 2 * squared, 16 * squared)
             self._begin(state, start)
         raise StepFailed(
             f"became unstable: elastic energy {energy:.2e} J after substeps of {dt:.2e} s; "
@@ -170,7 +139,7 @@ class Verlet(Integrator):
         """Set positions, velocities and forces to a state at time ``start`` [s] (collective)."""
         self.velocity.values[:] = (state.q - state.q_previous) / self.time_step
         self._update_fixed(start)
-        self.work = self.springs_work = 0.0
+        self.work = 0.0
         if state.q is not self.known:
             self.position.values[:] = state.q
             before = state.sides
@@ -204,42 +173,13 @@ class Verlet(Integrator):
         self._kick(time, 0.5 * duration, begin, time)
 
     def _count_work(self, moved: Rows, fixed: Mask) -> None:
-        """Add half the work [J] of the present forces to the work of springs, loads and anchors.
+        """Add half the work [J] of the present loads and anchors.
 
         moved : (owned, 3) displacements of the substep [m]
         fixed : (owned, 3) bool, components that anchors move against all forces
         """
-        self.springs_work += 0.5 * np.vdot(self.elastic, moved)
         forces = np.where(fixed, self.gradient[: self.lattice.owned], self.load)
         self.work += 0.5 * float(np.vdot(forces, moved))
-
-    def _is_to_halve(self, start: Rows, energy: float) -> bool:
-        """Return whether a step gained too much energy; if so, halve the substep length.
-
-        If the gain is negligible, the substep length of the next step doubles. With penalty
-        obstacles the length is never halved, because the springs may gain energy from the obstacles
-        (collective).
-
-        start  : (l, 3) positions at the start of the step [m]
-        energy : elastic energy at the end of the step [J]
-        """
-        own = self.elasticity.change(self.position.values, start) - float(self.springs_work)
-        mass = self.lattice.mass[: self.lattice.owned, None]
-        gain, kinetic = reduced(self.comm, [own, 0.5 * float(np.vdot(mass * self.v, self.v))])
-        total = energy + kinetic
-        limit = GAIN * total + ROUNDING * self.unstable_energy
-        gained = max(self.gained + gain, -OSCILLATION_CREDIT * total)
-        if (
-            min(gain, gained) > limit
-            and self.halvings < HALVINGS
-            and not self.environment.obstacles.penalties
-        ):
-            self.halvings += 1
-            return True
-        self.gained = gained
-        if gain < EASED * limit and self.halvings:
-            self.halvings -= 1
-        return False
 
     def _squared_acceleration(self) -> float:
         """Return |M^(-1) (f_ext - grad E)|_M^2 [J/s^2] of this rank's free nodes."""
@@ -262,11 +202,9 @@ class Verlet(Integrator):
         """Compute the gradient of elastic and contact energy at the present positions."""
         self.gradient[:] = 0
         self.elasticity.add_gradient(self.position.values, self.gradient)
-        self.elastic = self.gradient[: self.lattice.owned]
         contact = self.environment.obstacles.push(time, self.sides)
         self.contact = contact.at(self.q) if contact else None
         if self.contact:
-            self.elastic = self.elastic.copy()
             self.contact.add_gradient(self.gradient)
 
     def _kick(self, time: float, duration: float, begin: float, end: float) -> None:

@@ -15,10 +15,9 @@ from msmpetsc.build import Model
 from msmpetsc.comm import reduced
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
-from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.time import STATIC
-from msmpetsc.solve.integrators.static import SLENDER, Static
+from msmpetsc.solve.integrators.static import SLENDER, Static, time_of_sound
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.lobpcg import Lobpcg
 from msmpetsc.solve.nonlinear.step import Stepper
@@ -151,11 +150,3 @@ def _turned(search: Lobpcg, squares: Floats, modes: Rows) -> Rows:
         turn, upper = np.linalg.qr(parts[alike, : len(alike)])
         modes[alike] = (turn * np.sign(upper.diagonal())).T @ modes[alike]
     return modes
-
-
-def time_of_sound(lattice: Lattice) -> float:
-    """Return the travel time [s] of sound, of speed sqrt(E / density), along the longest side."""
-    stiffness = float(lattice.cell_stiffness[: lattice.cells_owned].sum())
-    mass, edges = reduced(lattice.table.comm, [float(lattice.mass.sum()), stiffness])
-    # An edge has the stiffness 4/7 E h (lattice.material)
-    return lattice.longest_side() / lattice.cell_size * float(np.sqrt(4 / 7 * mass / edges))

@@ -160,11 +160,7 @@ class Static(ImplicitEuler):
 
     def _first_tau(self) -> float:
         """Return SLENDER times the travel time [s] of sound along the longest side (collective)."""
-        lattice = self.environment.lattice
-        cells = lattice.longest_side() / lattice.cell_size
-        sums = np.array([float(lattice.mass.sum()), _stiffness(lattice)])
-        mass, stiffness = reduced(self.comm, sums)
-        return SLENDER * float(cells * np.sqrt(mass / max(stiffness, np.finfo(float).tiny)))
+        return SLENDER * time_of_sound(self.environment.lattice)
 
     def set_up(self) -> None:
         """Choose tau and build the preconditioner.
@@ -236,12 +232,16 @@ def _rigid_rank(unknowns: Unknowns, fixed: Mask) -> int:
     return int(np.linalg.matrix_rank(rows))
 
 
-def _stiffness(lattice: Lattice) -> float:
-    """Return the sum of the stiffnesses [N/m] of this rank's springs, or of the springs of L."""
+def time_of_sound(lattice: Lattice) -> float:
+    """Return about the travel time [s] of sound along the longest side (collective)."""
     if lattice.solid is None:
-        return float(lattice.stiffness[: lattice.springs_owned].sum())
-    bounds = lattice.solid.bounds[: lattice.cells_owned]
-    return float(4 / 3 * bounds.sum() / lattice.cell_size**2)
+        stiffness = float(lattice.stiffness[: lattice.springs_owned].sum())
+    else:
+        bounds = lattice.solid.bounds[: lattice.cells_owned]
+        stiffness = float(4 / 3 * bounds.sum() / lattice.cell_size**2)
+    mass, stiffness = reduced(lattice.table.comm, [float(lattice.mass.sum()), stiffness])
+    cells = lattice.longest_side() / lattice.cell_size
+    return cells * float(np.sqrt(mass / max(stiffness, np.finfo(float).tiny)))
 
 
 def refuse_free_bodies(unknowns: Unknowns) -> None:

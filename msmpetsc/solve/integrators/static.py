@@ -20,7 +20,7 @@ from typing import ClassVar
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Mask, Positions, Rows, to_host
+from msmpetsc.backend.arrays import Mask, Rows, to_host
 from msmpetsc.checkpoint import ANY, Range
 from msmpetsc.comm import log, reduced
 from msmpetsc.elasticity.locate import of_body, worst_inverted
@@ -55,7 +55,7 @@ class LoadPath:
 
     base      : (l, 3) positions x_0 of the last state [m]
     target    : (l, 3) prescribed positions at the whole load [m]; None without anchors
-    known     : shares and positions (l, 3) [m] of the last two equilibria
+    reached   : (l, 3) positions of the last equilibrium [m]
     sides     : (o, l) contact faces of the last share
     displaced : whether the last state is an initial state other than the rest shape
     inverted  : number of inverted cells in the last state; 0 for an initial state
@@ -71,7 +71,7 @@ class LoadPath:
     def __post_init__(self) -> None:
         self.base = self.state.q
         self.target = self.environment.anchors.prescribed(self.base, self.time)
-        self.known = [(0.0, self.base)]
+        self.reached = self.base
         self.sides = self.state.sides
         first, lattice = self.time < 1.5 * self.time_step, self.stepper.lattice
         at_rest = reduced(self.stepper.comm, bool((self.base == lattice.nodes).all()), MPI.LAND)
@@ -85,14 +85,13 @@ class LoadPath:
 
         Raises StepFailed if the solve fails, or if smaller load steps may avoid inverted cells.
         """
-        share = steps.end
-        q = self.known[-1][1]
+        share, q = steps.end, self.reached
         # Obstacles move in the first load step only.
-        time_step = 0.0 if len(self.known) > 1 else self.time_step
+        time_step = 0.0 if steps.count else self.time_step
         fixed = self.stepper.lattice.pinned
         load = self.environment.forces.at(self.time)
         faces = ContactFaces(self.environment, q, q, load, self.time, time_step, self.sides, fixed)
-        result = faces.solve(lambda whole: self._step(self._problem(whole, share), share))
+        result = faces.solve(lambda whole: self.stepper.step(self._problem(whole, share), q))
         lattice = self.stepper.lattice
         count, where = worst_inverted(
             self.stepper.comm, lattice, result.position, corners=self.displaced
@@ -101,13 +100,8 @@ class LoadPath:
             raise StepFailed(
                 f"turned {count - self.inverted} cells inside out, the worst {where}", "inverted"
             )
-        self.known = [self.known[-1], (share, result.position)]
-        self.problem, self.sides = result.problem, faces.sides
+        self.reached, self.problem, self.sides = result.position, result.problem, faces.sides
         return result
-
-    def _step(self, problem: StepProblem, share: float) -> StepResult:
-        """Return the solution of the problem of a share. Raises StepFailed."""
-        return self.stepper.step(problem, self._guess(problem, share))
 
     def _problem(self, whole: StepProblem, share: float) -> StepProblem:
         """Return the problem of a share of the load; ``whole`` is the problem of the whole load."""
@@ -127,21 +121,6 @@ class LoadPath:
                 self.base, self.time, self.time - self.time_step, share
             )
         return replace(whole, y=self.base, load=load, prescribed=prescribed)
-
-    def _guess(self, problem: StepProblem, share: float) -> Positions:
-        """Return the last equilibrium or an extrapolation (l, 3) [m]: the one with the lower g."""
-        (share_before, before), (reached, q) = self.known[0], self.known[-1]
-        if reached == share_before:
-            return q
-        functional = self.stepper.functional
-        fixed = self.stepper.lattice.fixed
-        ahead = q + (share - reached) / (reached - share_before) * (q - before)
-        functional.begin(problem)
-        values = [
-            functional.value(np.where(fixed, problem.fixed_positions, guess))
-            for guess in (q, ahead)
-        ]
-        return ahead if values[1] < values[0] else q
 
 
 class Static(ImplicitEuler):

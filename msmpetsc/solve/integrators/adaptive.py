@@ -40,8 +40,6 @@ from msmpetsc.solve.work import Work
 
 # levels of the shortest and the longest step, 1/1024 and 64 times the scene's step
 LOWEST, HIGHEST = -10, 6
-# number of step lengths whose integrators are kept; neighbouring lengths alternate
-KEPT = 4
 # end of a step before an event [time of the event]; the event must not act yet
 JUST_BEFORE = 1 - 0.5 * AT_EVENT
 # part of the saved credit that a step may spend [-]; savings must last for an impact
@@ -215,9 +213,9 @@ class Adaptive(Integrator):
     longer than the scene's step, the state's time may lie beyond the frame. The history of a state
     is the start of the last step.
 
-    integrators : level -> integrator; the integrator used last comes last
-    tick        : time of the state in ticks (Ticks)
-    last        : level of the last step
+    integrator : integrator of the last step, of the level ``made``; None before the first step
+    tick       : time of the state in ticks (Ticks)
+    last       : level of the last accepted step
     """
 
     uses_history = True
@@ -237,13 +235,13 @@ class Adaptive(Integrator):
             self.order, scene.time.error, self.time_step, steps * self.time_step, self.levels
         )
         self.ticks = Ticks(self.time_step, steps, self.levels[0], self.environment.events())
-        self.integrators: dict[int, Integrator] = {}
-        self.tick = self.last = 0
+        self.integrator: Integrator | None = None
+        self.tick = self.last = self.made = 0
         self.mass = reduced(self.comm, float(self.lattice.mass.sum()))
 
     def set_up(self) -> None:
         """Prepare the integrator of the first step, and log the range of step lengths."""
-        self._integrator(self.control.level)
+        self._of_level(self.control.level)
         shortest, longest = (self.time_step * 2.0**level for level in self.levels)
         log.info(
             "steps of %.3g to %.3g s, for an error of %.2g of the motion",
@@ -252,21 +250,14 @@ class Adaptive(Integrator):
             self.control.asked,
         )
 
-    def _integrator(self, level: int) -> Integrator:
-        """Return the integrator of a level; if the level is new, drop data of earlier steps."""
-        if level not in self.integrators:
+    def _of_level(self, level: int) -> Integrator:
+        """Return an integrator of a level: the present integrator, or a new integrator."""
+        if self.integrator is None or level != self.made:
+            self.destroy()
             time = self.time.model_copy(update={"step": self._length(level), "error": None})
-            self.integrators[level] = self.make(time, self.solver)
-            self.integrators[level].set_up()
-            if self.tick:
-                # A new integrator must behave like a kept integrator.
-                self.integrators[level].forget()
-        elif level != next(reversed(self.integrators)):
-            self.integrators[level] = self.integrators.pop(level)
-            self.integrators[level].forget()
-        while len(self.integrators) > KEPT:
-            self.integrators.pop(next(iter(self.integrators))).destroy()
-        return self.integrators[level]
+            self.integrator, self.made = self.make(time, self.solver), level
+            self.integrator.set_up()
+        return self.integrator
 
     def _length(self, level: int) -> float:
         """Return the length [s] of a step of a level."""
@@ -319,7 +310,7 @@ class Adaptive(Integrator):
             before = self._start_of(state, level, restarts)
             end = self._end_time(self.tick + self.ticks.length(level))
             try:
-                result, after = take_step(self.balance, self._integrator(level), before, end)
+                result, after = take_step(self.balance, self._of_level(level), before, end)
                 measure = self._measure(before, result, after, level)
                 is_accepted = self.control.accepts(level, measure)
             except StepFailed:
@@ -402,17 +393,13 @@ class Adaptive(Integrator):
     def save(self, checkpoint: Checkpoint) -> None:
         for part in (self, self.control):
             checkpoint.keep_counts(part)
-        last_used = next(reversed(self.integrators))
-        self.integrators[last_used].save(checkpoint)
+        if self.integrator:
+            self.integrator.save(checkpoint)
 
     def restore(self, checkpoint: Checkpoint, time: float) -> None:
         for part in (self, self.control):
             checkpoint.restore_counts(part)
-        self._integrator(self.last).restore(checkpoint, self._end_time(self.tick))
-
-    def forget(self) -> None:
-        for integrator in self.integrators.values():
-            integrator.forget()
+        self._of_level(self.last).restore(checkpoint, self._end_time(self.tick))
 
     def sum_up(self) -> None:
         """Log the estimated error of the motion at the end of a run."""
@@ -423,5 +410,6 @@ class Adaptive(Integrator):
         )
 
     def destroy(self) -> None:
-        for integrator in self.integrators.values():
-            integrator.destroy()
+        if self.integrator:
+            self.integrator.destroy()
+            self.integrator = None

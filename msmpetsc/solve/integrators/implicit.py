@@ -313,9 +313,6 @@ class ImplicitEuler(Integrator):
         checkpoint.restore_counts(self)
         self.stepper.optimality.curvature.restore(checkpoint)
 
-    def forget(self) -> None:
-        self.stepper.forget()
-
     def destroy(self) -> None:
         self.stepper.destroy()
 

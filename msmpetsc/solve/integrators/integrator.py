@@ -127,8 +127,5 @@ class Integrator(Protocol):
     def restore(self, checkpoint: Checkpoint, time: float) -> None:
         """Resume after the step that ended at ``time`` [s]."""
 
-    def forget(self) -> None:
-        """Drop all data of earlier steps, so that the next step depends on the state alone."""
-
     def destroy(self) -> None:
         """Destroy all PETSc objects."""

@@ -95,9 +95,6 @@ class Verlet(Integrator):
     def restore(self, checkpoint: Checkpoint, time: float) -> None:
         checkpoint.restore_counts(self)
 
-    def forget(self) -> None:
-        self.known = self.anchors = None
-
     def advance(self, state: State, time: float) -> tuple[StepResult, State]:
         """Take the step that ends at ``time`` [s] (collective). Raises StepFailed.
 

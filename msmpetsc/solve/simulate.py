@@ -421,11 +421,8 @@ class Forces:
         if step and step.viscous is not None:
             forces += step.viscous
         if step and step.problem:
-            forces += (
-                self.model.lattice.mass[:, None]
-                * (q[:owned] - step.problem.y[:owned])
-                / step.tau**2
-            )
+            accelerated = (q[:owned] - step.problem.y[:owned]) / step.tau**2
+            forces += self.model.lattice.mass[:, None] * accelerated
         return forces
 
     def _pushes(self, q: Positions, contact: StepContactAt | None) -> dict[str, Any]:

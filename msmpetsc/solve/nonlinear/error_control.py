@@ -113,18 +113,16 @@ class ErrorControl:
 
     def judge(self, iterate: Iterate, before: Outcome) -> Outcome:
         """Return the outcome at an iterate, with an upper bound of its error."""
-        residual, distance = (
-            self.functional.dual_norm(iterate.f),
-            self.functional.distance(iterate.q),
-        )
+        residual = self.functional.dual_norm(iterate.f)
+        distance = self.functional.distance(iterate.q)
         stays = residual > STAYS * before.residual
         at_rounding = self.rounding.explains(iterate, stays)
         alarm = min(before.alarm, Alarm.ON_THE_WAY)
-        now = replace(
-            before, residual=residual, distance=distance, at_rounding=at_rounding, alarm=alarm
-        )
         reduction = residual / before.residual if np.isfinite(before.residual) else 1.0
-        now = replace(now, corrected=False, reduction=reduction, compression=None)
+        now = Outcome(
+            before.goal, before.error, before.bound, residual, distance, reduction,
+            alarm=alarm, at_rounding=at_rounding, doubts=before.doubts,
+        )  # fmt: skip
         # At the start x = y, the distance 0 gives no relative error
         if not distance > 0 or not np.isfinite(residual):
             return replace(now, error=0.0 if at_rounding else np.inf)
@@ -153,11 +151,9 @@ class ErrorControl:
 
     def with_compression(self, iterate: Iterate, now: Outcome) -> Outcome:
         """Return the outcome with the compression of its iterate."""
-        return (
-            now
-            if now.compression
-            else replace(now, compression=self.curvature.compression(iterate.q))
-        )
+        if now.compression:
+            return now
+        return replace(now, compression=self.curvature.compression(iterate.q))
 
     def estimated(self, iterate: Iterate, now: Outcome, goal: float) -> Outcome:
         """Return the outcome with an estimated error.
@@ -204,13 +200,7 @@ class ErrorControl:
         if not has_moved and goal < closest and not is_saddle:
             return None
         goal = max(goal, min(closest, now.goal)) if has_moved else goal
-        return replace(
-            now,
-            goal=goal,
-            doubts=now.doubts + 1,
-            bound=np.inf,
-            corrected=False,
-        )
+        return replace(now, goal=goal, doubts=now.doubts + 1, bound=np.inf, corrected=False)
 
     def forget(self) -> None:
         self.ratio = FIRST_RATIO
@@ -239,11 +229,9 @@ def not_converged(
 
 def no_minimum(now: Outcome, worst: str) -> StepFailed:
     """Return the failure of a step that found too many points that are no minimum."""
-    seen = (
-        "a saddle or a fold"
-        if np.isinf(now.error)
-        else "a point farther from its solution than it seemed"
-    )
+    seen = "a point farther from its solution than it seemed"
+    if np.isinf(now.error):
+        seen = "a saddle or a fold"
     return StepFailed(
         f"did not come to a minimum: it came to {seen} {now.doubts} times, "
         f"residual |F| = {now.residual:.2e}{worst}; "

@@ -58,12 +58,10 @@ class FirstGuess:
 
     def with_fixed(self, guess: Positions) -> Positions:
         """Return the guess (l, 3) [m] with fixed nodes at their places after the step."""
-        lattice = self.functional.lattice
-        return (
-            np.where(lattice.fixed, self.functional.problem.fixed_positions, guess)
-            if self.has_fixed
-            else guess
-        )
+        if not self.has_fixed:
+            return guess
+        fixed = self.functional.lattice.fixed
+        return np.where(fixed, self.functional.problem.fixed_positions, guess)
 
     def drift(self, moved: Rows) -> Floats | float:
         """Return the mean (3,) by mass of displacements (l, 3) [m]; 0 if some nodes are fixed."""

@@ -51,15 +51,11 @@ class Jacobian:
 
     def __post_init__(self) -> None:
         functional, options, true_hessian = self.functional, self.options, self.preset.true_hessian
-        self.comm, self.unknowns, elasticity = (
-            functional.comm,
-            functional.unknowns,
-            functional.elasticity,
-        )
+        self.comm, self.unknowns = functional.comm, functional.unknowns
         self.diagonal = self._diagonal()
         self.hessian = TrueHessian(
             self.unknowns,
-            elasticity,
+            functional.elasticity,
             functional.time_step,
             self._contact_blocks(),
             functional.scratch,
@@ -124,9 +120,7 @@ class Jacobian:
         blocks = np.zeros((len(lattice.nodes), 9), like=lattice.nodes)
         self.functional.elasticity.add_bound(lattice.nodes, blocks)
         stiffness = blocks[unknowns.free][:, [0, 4, 8]].sum(axis=1)
-        diagonal: Floats = (
-            unknowns.inertia[unknowns.free] + self.functional.time_step**2 * stiffness
-        )
+        diagonal: Floats = unknowns.inertia[unknowns.free] + self.functional.t2 * stiffness
         return diagonal
 
     def linearise(

@@ -62,13 +62,8 @@ class Optimality:
         curvature: LowestCurvature,
         rounding: Rounding,
     ):
-        self.functional, self.estimate, self.curvature, self.rounding = (
-            functional,
-            estimate,
-            curvature,
-            rounding,
-        )
-        self.memory = functional.memory
+        self.functional, self.memory = functional, functional.memory
+        self.estimate, self.curvature, self.rounding = estimate, curvature, rounding
 
     def examine(self, at: Iterate, outcome: Outcome, acceptable: float) -> Verdict:
         """Examine g at x - e, or at x if the iterate has no correction e; return the verdict.
@@ -98,18 +93,14 @@ class Optimality:
         rest = functional.dual_norm(examined.f) / value
         # An upper bound if g is as convex on the path to the minimum
         if value > CONVEX and length + rest <= acceptable:
-            return Verdict(
-                self.rounding.relative(length + rest, functional.distance(examined.q)), examined
-            )
+            return Verdict(self._relative(length + rest, examined), examined)
         if corrected and value <= CONVEX < estimate.lowest:
             # The estimate took the missing part of the error to be too small
             again = bool(np.isfinite(estimate(at)))
             return self.examine(at, replace(outcome, corrected=again), acceptable)
         estimated = estimate.correction_norm + estimate.missing
         if corrected and bent <= SMALL * estimated and value > CONVEX:
-            return Verdict(
-                self.rounding.relative(estimated, functional.distance(examined.q)), examined
-            )
+            return Verdict(self._relative(estimated, examined), examined)
         return Verdict(self._second_estimate(examined, length, rest, acceptable, value), examined)
 
     def _corrected_iterate(self, at: Iterate) -> Iterate | None:
@@ -139,19 +130,22 @@ class Optimality:
         the error may be far larger. If F is rounding alone, CG may break down. Then ``bound``
         replaces the second correction, but if ``lowest`` is at most CONVEX, the error is infinite.
         """
-        functional, estimate, relative = self.functional, self.estimate, self.rounding.relative
-        distance = functional.distance(examined.q)
+        functional, estimate, relative = self.functional, self.estimate, self._relative
         second = estimate(examined, max(acceptable - first, 0.0) if lowest > CONVEX else 0.0)
         if not np.isfinite(second):
-            return relative(first + bound, distance) if lowest > CONVEX else np.inf
+            return relative(first + bound, examined) if lowest > CONVEX else np.inf
         if functional.surface is not None:
             end, _, is_free = self._corrected(examined)
             functional.vectors.give_back(end)
             if not is_free:
-                return relative(first + DOUBTFUL * second, distance)
+                return relative(first + DOUBTFUL * second, examined)
         if first > 0 and estimate.correction_norm > SMALL * first:
-            return DOUBTFUL * relative(max(first, second), distance)
-        return relative(first + second, distance)
+            return DOUBTFUL * relative(max(first, second), examined)
+        return relative(first + second, examined)
+
+    def _relative(self, length: float, iterate: Iterate) -> float:
+        """Return the relative error of an iterate whose error has a length |e|_M [m sqrt(kg)]."""
+        return self.rounding.relative(length, self.functional.distance(iterate.q))
 
     def lower_iterate(self, at: Iterate, verdict: Verdict) -> Iterate | None:
         """Return an iterate of lower g than an iterate that is no minimum; None if none is found.

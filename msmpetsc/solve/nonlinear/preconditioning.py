@@ -223,18 +223,12 @@ class LatticePreconditioner(StepPreconditioner):
         return changed
 
     def most_iterations(self, rtol: float) -> int | None:
-        """Return the greatest number of iterations of a solve with an old hierarchy.
-
-        Return None if the hierarchy is of the present positions, or before its first solve.
-        """
-        return (
-            None
-            if self.is_new or self.rate is None
-            else int(self.rate * _digits(rtol) + PATIENCE - self.excess)
-        )
+        if self.is_new or self.rate is None:
+            return None
+        return int(self.rate * _digits(rtol) + PATIENCE - self.excess)
 
     def learn(self, its: int, rtol: float) -> None:
-        """Count the iterations of a linear solve to a relative tolerance.
+        """Count the iterations of a linear solve.
 
         A hierarchy is kept until its excess iterations have cost as much as a new hierarchy. So the
         total cost is at most twice the least possible cost.
@@ -250,9 +244,7 @@ class LatticePreconditioner(StepPreconditioner):
     def _build(self, q: Positions, contact: Rows, surface: SurfaceHessian | None) -> None:
         with HIERARCHY:
             self.multigrid.update(q, contact, surface)
-        self.rate = None
-        if self.is_first:
-            self.rate = USUAL_RATE
+        self.rate = USUAL_RATE if self.is_first else None
         self.excess = 0.0
         self.is_first = self.is_stale = False
 

@@ -168,16 +168,12 @@ class Stepper:
 
     def _refuse_of_snes(self) -> None:
         """Raise InputError for options of SNES that Newton's method does not use."""
-        given = PETSc.Options().getAll().items()
-        options = {
-            name.removeprefix(self.prefix): value
-            for name, value in given
-            if name.startswith(self.prefix)
-        }
-        for name, value in options.items():
-            if name.startswith(OF_SNES) and LOOP.get(name) != value:
+        for given, value in PETSc.Options().getAll().items():
+            name = given.removeprefix(self.prefix)
+            is_ours = given.startswith(self.prefix) and name.startswith(OF_SNES)
+            if is_ours and LOOP.get(name) != value:
                 raise InputError(
-                    f"-{self.prefix}{name}: newton's presets have a loop and a line search of "
+                    f"-{given}: newton's presets have a loop and a line search of "
                     "their own; presets anderson and lbfgs take it"
                 )
 
@@ -264,21 +260,17 @@ class Stepper:
 
         Raises StepFailed, StepStopped and InputError.
         """
-        newton = self.method
-        if not (
-            isinstance(newton, Newton) and self.static and self.stiffest > 2 and not self.budget
-        ):
-            return self.method.minimise(start, outcome)
+        newton, may_soften = self.method, self.static and self.stiffest > 2 and not self.budget
+        if not (isinstance(newton, Newton) and may_soften):
+            return newton.minimise(start, outcome)
         newton.ends_on_overshoot = True
         try:
             now, reached = newton.minimise(start, outcome)
         finally:
             newton.ends_on_overshoot = False
-        return (
-            newton.minimise(self._softened(newton, now), outcome)
-            if newton.overshot
-            else (now, reached)
-        )
+        if newton.overshot:
+            return newton.minimise(self._softened(newton, now), outcome)
+        return now, reached
 
     def _softened(self, newton: Newton, now: Iterate) -> Iterate:
         """Return a start for the solid's own lambda: the last of several softer solutions.
@@ -319,12 +311,8 @@ class Stepper:
         ksp_its = total_iterations(self.ksp) + of_estimates + self.optimality.curvature.search.its
         products = self.jacobian.hessian.products + self.jacobian.preconditioner.products
         proof = self.control.estimate.products + self.optimality.curvature.products
-        return Work(
-            iterations=self.method.iterations,
-            ksp_its=ksp_its,
-            products=products,
-            proof_products=proof,
-        )
+        iterations = self.method.iterations
+        return Work(0.0, iterations, ksp_its, products, proof)
 
     def spent(self) -> Work:
         """Return the work of the step in progress so far."""

@@ -9,10 +9,7 @@ from block_scene import block_scene, play
 # duration of about a period [s]
 DURATION = 0.03
 # released far from equilibrium
-SWING = {
-    "start": {"scale": [1.2, 1.0, 0.9]},
-    "output": {"surface": False, "every": 1000},
-}
+SWING = {"start": {"scale": [1.2, 1.0, 0.9]}, "output": {"surface": False, "every": 1000}}
 
 
 def bar(folder: Path, **tables) -> Path:
@@ -23,12 +20,8 @@ def bar(folder: Path, **tables) -> Path:
 @pytest.fixture(scope="module")
 def exact(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
     """Return frames by explicit substeps, 60 to the shortest step; their error is of order 2."""
-    time = {
-        "step": DURATION / 8,
-        "duration": DURATION,
-        "integrator": "verlet",
-        "substep": DURATION / 20000,
-    }
+    time = {"step": DURATION / 8, "duration": DURATION}
+    time |= {"integrator": "verlet", "substep": DURATION / 20000}
     return play(bar(tmp_path_factory.mktemp("exact"), time=time))[1][-1].position
 
 

@@ -50,10 +50,7 @@ def write_case(folder: Path, name: str, **solver) -> Path:
     scene = {
         "mesh": {"source": "body.ply"},
         # the scene in which the saddles were found
-        "cages": {
-            "count": case.pop("cells"),
-            "boundary": "whole",
-        },
+        "cages": {"count": case.pop("cells"), "boundary": "whole"},
         "material": {"young_modulus": case.pop("young"), "density": 1000.0, "law": "linear"},
         "time": {"step": (step := case.pop("step")), "duration": case.pop("frames") * step},
         "solver": {"error": 1e-3} | solver,

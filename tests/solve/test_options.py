@@ -11,6 +11,7 @@ from conftest import ENVIRONMENT, python, run
 from lattices import beam, swing, weight
 from mpi4py import MPI
 from one_process import NOISE, assert_one_line, command_error, input_error
+from petsc4py import PETSc
 
 from msmpetsc.app.ranks import ALONE
 from msmpetsc.cli.command_table import COMMANDS
@@ -299,8 +300,6 @@ def test_a_load_beyond_all_numbers_is_told(tmp_path: Path, load: str):
 @pytest.mark.parametrize("preset", ["newton", "anderson", "lbfgs"])
 def test_the_reason_says_which_rule_ended_the_step(preset: str):
     """The rules are a short correction, a small |F|, and the budget."""
-    from petsc4py import PETSc
-
     reasons, seen = PETSc.SNES.ConvergedReason, set()
     lattice = beam()
     for error, budget in ((1e-1, None), (1e-2, None), (2e-2, None), (1e-3, None), (1e-12, 2)):

@@ -58,7 +58,7 @@ def test_a_mass_hangs_on_a_spring(preset: str):
 
 def test_states_under_forces_that_come_and_go(tmp_path: Path):
     """Each time has its state. States under the same loads are equal and take no iteration."""
-    states = {"step": 1.0, "duration": 6.0, "integrator": "static"}
+    states = STATE | {"duration": 6.0}
     model, frames = play(column(tmp_path, states, pin=[{"region": BOTTOM}], force=SWITCHED))
     there, back, rest = (moved(model, frames[n]) for n in (1, 3, 5))
     assert there[0] > 0.05 and back * [1, 1, 1] == pytest.approx(there * [-1, 1, 1], abs=1e-7)
@@ -70,7 +70,7 @@ def test_states_under_forces_that_come_and_go(tmp_path: Path):
 
 def test_anchors_lead_from_state_to_state_and_let_go(tmp_path: Path):
     anchor = {"region": TOP, "path": [{"time": 2.0, "by": [0.0, 0.8, -0.4]}], "stop": 3.0}
-    states = {"step": 1.0, "duration": 3.0, "integrator": "static"}
+    states = STATE | {"duration": 3.0}
     model, frames = play(column(tmp_path, states, pin=[{"region": BOTTOM}], anchor=[anchor]))
     assert moved(model, frames[1]) == pytest.approx([0, 0.4, -0.2])
     assert moved(model, frames[2]) == pytest.approx([0, 0.8, -0.4])

@@ -18,6 +18,12 @@ from msmpetsc.solve.petsc.library import petsc_errors
 from msmpetsc.solve.presets import PRESETS, find_preset
 
 
+def brick(*cells: int, young: float = 2e5) -> Lattice:
+    """Return a free lattice of springs with cells of 0.1 m."""
+    material = Material(density=1000, young_modulus=young, law="linear")
+    return build_lattice(cages_of(block(*cells), 0.1), material)
+
+
 def residual(lattice: Lattice, x: np.ndarray, q: np.ndarray, before: np.ndarray) -> np.ndarray:
     """Return F(x) by numpy alone, at the free nodes."""
     ends = x[lattice.springs]
@@ -42,9 +48,7 @@ def test_free_fall_is_the_schemes_own(preset: str):
 
     With ``paper`` this holds to the tolerance of the KSP.
     """
-    lattice = build_lattice(
-        cages_of(block(3, 2, 2), 0.1), Material(density=1000, young_modulus=2e5, law="linear")
-    )
+    lattice = brick(3, 2, 2)
     fallen = swing(preset, 5, lattice)[-1].position - lattice.nodes
     tolerance = {"paper": 1e-8}.get(preset, 1e-12)
     np.testing.assert_allclose(
@@ -90,10 +94,8 @@ def test_every_preset_comes_as_near_as_it_says(preset: str, error: float):
         stepper = Stepper(COMM, lattice, T, find_preset(name), error=error)
         try:
             result = stepper.step(StepProblem(q, 2 * q - before, weight(lattice)))
-            return (
-                result,
-                stepper.snes.reason == PETSc.SNES.ConvergedReason.CONVERGED_SNORM_RELATIVE,
-            )
+            by_estimate = PETSc.SNES.ConvergedReason.CONVERGED_SNORM_RELATIVE
+            return result, stepper.snes.reason == by_estimate
         finally:
             stepper.destroy()
 
@@ -138,10 +140,7 @@ def test_cg_and_cholesky_give_the_same_step(petsc_options):
     ("preset", "options"),
     [
         # this method takes no initial guess for its solves
-        (
-            "newton",
-            {"ksp_type": "preonly", "pc_type": "cholesky"},
-        ),
+        ("newton", {"ksp_type": "preonly", "pc_type": "cholesky"}),
         # Chebyshev's method applies the Hessian when it is set up
         ("newton", {"ksp_type": "chebyshev"}),
         # Newton's loop solves without a nonlinear preconditioner
@@ -156,7 +155,6 @@ def test_another_type_goes_with_a_preset(petsc_options, preset: str, options: di
 
 def test_a_fault_of_ours_within_petsc_is_no_bad_option():
     """PETSc 3.18 passes a callback's exception on, 3.26 makes it the cause of its own error."""
-    from petsc4py import PETSc
 
     def fault(*_):
         raise ZeroDivisionError
@@ -177,8 +175,6 @@ def test_garbage_is_collected_again_after_the_outermost_block():
 
 
 def test_a_preset_leaves_no_options_behind():
-    from petsc4py import PETSc
-
     before = PETSc.Options().getAll()
     for preset in PRESETS:
         swing(preset, 1)
@@ -187,9 +183,7 @@ def test_a_preset_leaves_no_options_behind():
 
 def test_A_is_M_plus_t2_L():
     """A equals a dense sum over springs. Without pins its rows sum to the mass."""
-    lattice = build_lattice(
-        cages_of(block(2, 2, 1), 0.1), Material(density=1000, young_modulus=2e5, law="linear")
-    )
+    lattice = brick(2, 2, 1)
     stepper = Stepper(COMM, lattice, T, find_preset("anderson"))
     rows = np.arange(lattice.owned, dtype=np.int32)
     A = stepper.jacobian.matrix.getValues(rows, rows)
@@ -204,9 +198,7 @@ def test_A_is_M_plus_t2_L():
 
 def test_a_plain_iteration_is_the_papers_global_step():
     """x - A^(-1) F(x) at y is (M + t^2 L)^(-1) (t^2 J d + M y + t^2 f_ext), Eq. 17."""
-    lattice = build_lattice(
-        cages_of(block(2, 2, 1), 0.1), Material(density=1000, young_modulus=2e5, law="linear")
-    )
+    lattice = brick(2, 2, 1)
     lattice = replace(lattice, rest_length=0.95 * lattice.rest_length)
     stepper = Stepper(COMM, lattice, T, find_preset("fast-msm"), max_iterations=1)
     rows = np.arange(lattice.owned, dtype=np.int32)
@@ -243,9 +235,7 @@ def test_a_strut_that_buckles_under_its_load():
 
 def test_a_body_pressed_to_half_still_gives_a_descent():
     """Springs under compression make the true Hessian indefinite; newton must still lower g."""
-    lattice = build_lattice(
-        cages_of(block(4, 3, 3), 0.1), Material(density=1000, young_modulus=2e6, law="linear")
-    )
+    lattice = brick(4, 3, 3, young=2e6)
     pressed = lattice.nodes * [1, 1, 0.5] + 1e-3 * np.random.default_rng(1).normal(
         size=lattice.nodes.shape
     )

@@ -119,10 +119,16 @@ class ErrorControl:
         at_rounding = self.rounding.explains(iterate, stays)
         alarm = min(before.alarm, Alarm.ON_THE_WAY)
         reduction = residual / before.residual if np.isfinite(before.residual) else 1.0
-        now = Outcome(
-            before.goal, before.error, before.bound, residual, distance, reduction,
-            alarm=alarm, at_rounding=at_rounding, doubts=before.doubts,
-        )  # fmt: skip
+        now = replace(
+            before,
+            residual=residual,
+            distance=distance,
+            reduction=reduction,
+            corrected=False,
+            alarm=alarm,
+            at_rounding=at_rounding,
+            compression=None,
+        )
         # At the start x = y, the distance 0 gives no relative error
         if not distance > 0 or not np.isfinite(residual):
             return replace(now, error=0.0 if at_rounding else np.inf)

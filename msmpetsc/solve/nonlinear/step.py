@@ -311,8 +311,8 @@ class Stepper:
         ksp_its = total_iterations(self.ksp) + of_estimates + self.optimality.curvature.search.its
         products = self.jacobian.hessian.products + self.jacobian.preconditioner.products
         proof = self.control.estimate.products + self.optimality.curvature.products
-        iterations = self.method.iterations
-        return Work(0.0, iterations, ksp_its, products, proof)
+        its = self.method.iterations
+        return Work(iterations=its, ksp_its=ksp_its, products=products, proof_products=proof)
 
     def spent(self) -> Work:
         """Return the work of the step in progress so far."""

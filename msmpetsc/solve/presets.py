@@ -59,8 +59,7 @@ LATTICE_MULTIGRID = {
     "mg_levels_ksp_max_it": "1",
     "mg_coarse_ksp_type": "preonly",
     "mg_coarse_pc_type": "redundant",
-    "mg_coarse_redundant_pc_type": "python",
-    "mg_coarse_redundant_pc_python_type": "msmpetsc.solve.multigrid.block_cholesky.BlockCholesky",
+    "mg_coarse_redundant_pc_type": "lu",
 }
 # options of Newton's method; nonlinear.jacobian chooses pc_type
 NEWTON = {

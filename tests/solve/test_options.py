@@ -131,7 +131,7 @@ WITH_THE_SOLVERS = {
 }
 # options of multigrid's cycle that go together, and words of their effect
 OBEYED = {
-    "-pc_mg_levels 2 -mg_levels_ksp_max_it 2 -mg_coarse_pc_type cholesky "
+    "-pc_mg_levels 2 -mg_levels_ksp_max_it 2 -mg_coarse_pc_type lu "
     "-ksp_view": "MULTIPLICATIVE, levels=2",
     "-pc_mg_levels 3 -pc_mg_cycle_type w -matptap_via scalable -pc_mg_log "
     "-log_view": "MGSmooth Level 1",

@@ -85,10 +85,8 @@ class Products(NamedTuple):
 
 WEIGHTS = _weights()
 # products of a spring, at the index 28 times the code of its first end plus the code of
-# its second end
-OF_SPRINGS = Products.of((WEIGHTS[:, None, :] - WEIGHTS[None, :, :]).reshape(-1, 8))
-# products of a node, at its code
-OF_NODES = Products.of(WEIGHTS)
+# its second end; a node is a spring with a pinned second end
+PRODUCTS = Products.of((WEIGHTS[:, None, :] - WEIGHTS[None, :, :]).reshape(-1, 8))
 
 
 class ByCell(NamedTuple):
@@ -118,17 +116,13 @@ class ByCell(NamedTuple):
         start = np.append(start, len(cells)).astype(np.int32)
         return cls(start, which[by_cell].astype(np.int32), code[by_cell].astype(np.uint8))
 
-    def to_device_of(self, array: Array) -> "ByCell":
-        """Return a copy in the memory, CPU or GPU, of an array."""
-        return ByCell(*(like(array, part) for part in self))
-
 
 class PairSum(NamedTuple):
     """Sum of the blocks of springs or nodes over the coarse cells.
 
     values   : (b, 6) upper triangles of the blocks
     places   : (c, 36) block of each pair of a coarse cell's corners, -1 if there is none
-    products : products of the weights of each code
+    products : products of the weights at the ends of each code, times t^2 [s^2]
     """
 
     values: Rows
@@ -182,15 +176,12 @@ class GalerkinSum:
             unknowns, elasticity, decode_morton(keys), offsets, copies
         )
         self.weights, self.full = (like(lattice.nodes, a) for a in (t2**0.5 * WEIGHTS, SYMMETRIC))
-        of_springs = OF_SPRINGS._replace(factor=t2 * OF_SPRINGS.factor)
-        self.of_springs, self.of_nodes = (
-            Products(*(like(lattice.nodes, part) for part in products))
-            for products in (of_springs, OF_NODES)
-        )
-        # Places, and stiffnesses times t^2 [kg], of the springs that hold rollers
+        scaled_products = PRODUCTS._replace(factor=t2 * PRODUCTS.factor)
+        self.products = Products(*(like(lattice.nodes, part) for part in scaled_products))
+        # Places, and stiffnesses [N/m], of the springs that hold rollers
         node, component = (rows[lattice.rollers[0] < lattice.owned] for rows in lattice.rollers)
         self.rollers = node, like(node, np.array(DIAGONAL))[component]
-        self.ground = GROUND * t2 * stiff[node]
+        self.ground = GROUND * stiff[node]
         first, second, places = self._pairs(grid, corners)
         self.blocks, self.places = len(first), like(lattice.nodes, places)
         upper = np.flatnonzero(first != second)
@@ -246,15 +237,15 @@ class GalerkinSum:
         symmetric = np.zeros((self.blocks, 6), like=q)
         solid, viscosity = self.elasticity.solid, self.elasticity.viscosity
         if self.elasticity.springs:
-            of_springs = PairSum(symmetric, self.places, self.springs, self.of_springs)
+            of_springs = PairSum(symmetric, self.places, self.springs, self.products)
             add_springs(count, q, of_springs, self.elasticity.springs.owned)
-        # Matrix of single nodes [kg]
+        # Matrix of single nodes over t^2 [N/m]
         own = np.zeros((len(self.unknowns.ballast), 6), like=q)
-        own[:, DIAGONAL] = self.unknowns.ballast[:, None]
+        own[:, DIAGONAL] = self.unknowns.ballast[:, None] / self.t2
         own[self.rollers] += self.ground
         if len(contact):
-            own += self.t2 * contact[:, UPPER]
-        add_nodes(count, own, PairSum(symmetric, self.places, self.nodes, self.of_nodes))
+            own += contact[:, UPPER]
+        add_nodes(count, own, PairSum(symmetric, self.places, self.nodes, self.products))
         into = CellSum(symmetric[:, self.full], self.places, self.cells, self.weights)
         scratch = np.empty((1 if on_host(q) else count, 8, COARSE), like=q)
         hessians: list[CellHessians] = [solid.hessian_at(q, True)] if solid else []
@@ -301,7 +292,7 @@ def _by_cell(
     cells = encode_morton(decode_morton(bases[every // MOST_COPIES])[:, None] + CORNERS)
     which = moving, free, np.arange(len(corners))
     of_springs, of_nodes, of_cells = (
-        ByCell.of(number, every, code, items).to_device_of(lattice.nodes)
+        ByCell(*(like(lattice.nodes, part) for part in ByCell.of(number, every, code, items)))
         for number, code, items in zip(numbers, codes, which, strict=True)
     )
     return cells + of_corners, of_springs, of_nodes, of_cells
@@ -349,11 +340,11 @@ def add_springs(
 
 @kernel
 def add_nodes(first: int, count: int, step: int, own: Rows, into: PairSum) -> None:
-    """Add the upper triangles ``own`` (owned, 6) of the nodes' blocks."""
+    """Add t^2 times the upper triangles ``own`` (owned, 6) of the nodes' blocks."""
     values, places, (start, order, code), (begin, pair, factor) = into
     for i in range(first, count, step):
         for at in range(start[i], start[i + 1]):
-            node, kind = order[at], code[at, 0]
+            node, kind = order[at], 28 * code[at, 0] + PINNED
             for entry in range(begin[kind], begin[kind + 1]):
                 place = places[i, pair[entry]]
                 for c in range(6):

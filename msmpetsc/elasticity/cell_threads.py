@@ -26,8 +26,6 @@ from msmpetsc.elasticity.neo_hookean import (
     write_modes,
     write_state,
 )
-from msmpetsc.elasticity.springs import Displacement
-from msmpetsc.elasticity.vectors import Three
 
 
 @njit(inline="always")
@@ -54,12 +52,6 @@ def strains_at(q: Positions, cells: CellRows, i: int) -> Strains:
         strain((q[c[0], 2], q[c[1], 2], q[c[2], 2], q[c[3], 2],
                 q[c[4], 2], q[c[5], 2], q[c[6], 2], q[c[7], 2]), form),
     )  # fmt: skip
-
-
-@njit(inline="always")
-def gradient_at(q: Positions, cells: CellRows, i: int) -> Three:
-    """Return F of cell i at positions q (l, 3) [m]."""
-    return gradient_of(strains_at(q, cells, i), 1.0 / cells.h4)
 
 
 @kernel
@@ -123,9 +115,9 @@ def _write_states(
 
 @kernel
 def _write_changes(
-    first: int, count: int, step: int, parts: Floats, cells: CellRows, displacement: Displacement
+    first: int, count: int, step: int, parts: Floats, cells: CellRows, ends: tuple[Rows, Rows]
 ) -> None:
-    base, moved = displacement
+    moved, base = ends
     for i in range(first, count, step):
         k, d, e = constants_at(cells, i), strains_at(moved, cells, i), strains_at(base, cells, i)
         g, f = gradient_of(d, 1.0 / cells.h4), gradient_of(e, 1.0 / cells.h4)
@@ -167,7 +159,7 @@ def linearise(blocks: CellBlocks, q: Positions, projected: bool, state: Rows) ->
 def cell_changes(blocks: CellBlocks, count: int, q: Positions, base: Positions) -> Floats:
     """Return E(q) - E(base) [J] of each of the first cells (count,)."""
     parts: Floats = np.empty(count, like=q)
-    _write_changes(count, parts, one_by_one(blocks), Displacement.to(q, base))
+    _write_changes(count, parts, one_by_one(blocks), (q - base, base))
     return parts
 
 

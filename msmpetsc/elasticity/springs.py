@@ -106,27 +106,12 @@ def crushing_energy(lattice: Lattice) -> float:
     return float(0.5 * lattice.stiffness[springs] @ lattice.rest_length[springs] ** 2)
 
 
-class Displacement(NamedTuple):
-    """Positions ``base`` of nodes (l, 3) [m], and the displacement ``moved`` (l, 3) [m].
-
-    Energy changes are computed from ``moved``, which keeps the digits of a small displacement.
-    """
-
-    base: Positions
-    moved: Rows
-
-    @classmethod
-    def to(cls, end: Positions, base: Positions) -> "Displacement":
-        """Return the displacement from ``base`` to ``end``."""
-        return cls(base, end - base)
-
-
 @kernel
 def _elastic_change(
-    first: int, count: int, step: int, sums: Floats, springs: Springs, displacement: Displacement
+    first: int, count: int, step: int, sums: Floats, springs: Springs, nodes: tuple[Rows, Rows]
 ) -> None:
     ends, rest_length, stiffness = springs
-    base, moved = displacement
+    moved, base = nodes
     change = 0.0
     for s in range(first, count, step):
         before = vector(base, ends[s, 1], ends[s, 0])
@@ -151,7 +136,7 @@ class OwnedSprings:
         ends = self.owned.ends
         count = len(ends)
         sums = np.zeros(1 if on_host(ends) else count, like=ends, dtype=float)
-        _elastic_change(count, sums, self.owned, Displacement.to(q, base))
+        _elastic_change(count, sums, self.owned, (q - base, base))
         return float(sums.sum())
 
 

@@ -32,7 +32,6 @@ class Unknowns:
     """Number the free nodes of a lattice over all ranks, and exchange their ghosts.
 
     free    : (m,) local numbers of the free owned nodes
-    rows    : (m,) ``free`` as unsigned numbers, whose sign kernels need not check
     numbers : (l,) global number of each local node among the free nodes, -1 if pinned
     total   : number of free nodes on all ranks
     inertia : (owned,) [kg] mass in the residual; 0 for statics
@@ -50,7 +49,6 @@ class Unknowns:
         self.inertia = np.zeros_like(lattice.mass) if static else lattice.mass
         self.ballast = BALLAST * lattice.mass if static else lattice.mass
         self.free = np.flatnonzero(~lattice.pinned[: lattice.owned])
-        self.rows = self.free.astype(np.uint32)
         self.size = len(self.free)
         first: int = comm.exscan(self.size) or 0  # type: ignore[attr-defined]
         self.total = reduced(comm, self.size)
@@ -102,7 +100,7 @@ class Unknowns:
         if self.has_ghosts:
             with GHOSTS:
                 self.scatter.scatter(vector, self.ghost_values)
-        _spread(self.size, self.columns(vector), self.rows, nodes)
+        _spread(self.size, self.columns(vector), self.free, nodes)
         if len(self.free_ghosts):
             nodes[self.free_ghosts] = self.memory.read(self.ghost_values).reshape(-1, 3)
         nodes[self.rollers] = kept
@@ -129,7 +127,7 @@ class Unknowns:
     def scaled_sum(self, a: Array, t2: float, b: Array, vector: PETSc.Vec) -> None:
         """Write M a + t^2 b of arrays (l, 3) of nodal values to a vector of unknowns."""
         _scaled_sum(
-            self.size, self.columns_to_write(vector), Terms(self.inertia, a, t2, b, self.rows)
+            self.size, self.columns_to_write(vector), Terms(self.inertia, a, t2, b, self.free)
         )
         self.project(vector)
 

@@ -44,7 +44,7 @@ def test_what_contradicts_itself_is_refused(tmp_path: Path, msmpetsc):
 
 def test_a_package_that_is_not_there_is_named():
     with patch.dict("sys.modules", cupy=None):
-        assert "msmpetsc[cuda]" in device.missing_cuda()
+        assert "msmpetsc[cuda]" in device.what_is_missing()
 
 
 @pytest.mark.cuda

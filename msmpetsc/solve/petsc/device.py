@@ -65,16 +65,7 @@ def sender(comm: MPI.Comm) -> Callable[[Array], Array]:
 
 
 def what_is_missing() -> str | None:
-    """Return the reason why this process cannot compute on a GPU, as text; None if it can."""
-    if not PETSc.Sys.hasExternalPackage("cuda"):
-        return (
-            "this PETSc was built without CUDA; scripts/build_petsc_cuda builds a PETSc with CUDA"
-        )
-    return missing_cuda()
-
-
-def missing_cuda() -> str | None:
-    """Return the reason why Python cannot use a GPU, as text; None if it can.
+    """Return the reason why this process cannot compute on a GPU, as text; None if it can.
 
     The test asks the CUDA runtime, because PETSc crashes at exit if there is no GPU.
     """
@@ -84,10 +75,15 @@ def missing_cuda() -> str | None:
     except ImportError as error:
         return f"{error.name or 'CuPy'} cannot be imported; pip install 'msmpetsc[cuda]' brings it"
     try:
-        return None if cupy.cuda.runtime.getDeviceCount() else "no GPU is seen"
+        count = cupy.cuda.runtime.getDeviceCount()
     # A missing or old driver raises errors of CuPy, the CUDA runtime or the loader.
     except Exception as error:
         return f"no GPU is seen: {str(error).splitlines()[0]}"
+    if not count:
+        return "no GPU is seen"
+    if PETSc.Sys.hasExternalPackage("cuda"):
+        return None
+    return "this PETSc was built without CUDA; scripts/build_petsc_cuda builds a PETSc with CUDA"
 
 
 class Memory:

@@ -27,8 +27,6 @@ cuda: Any = untyped
 # threads of a block [-]; more would exceed the registers of kernels that visit all
 # neighbours of a node
 THREADS = 128
-# array descriptors in the cache [-]; bounds its memory
-KEPT = 4096
 # struct format of a scalar [-]; the driver takes each in eight bytes
 SCALARS = {bool: "?7x", int: "q", float: "d"}
 TYPES = {"?7x": numba.types.boolean, "q": numba.types.int64, "d": numba.types.float64}
@@ -66,7 +64,7 @@ def as_argument(value: Array | float | tuple[Any, ...]) -> tuple[Kind, Words]:
     return SCALARS[type(number)], (number,)  # type: ignore[return-value]  # no array
 
 
-@lru_cache(maxsize=KEPT)
+@lru_cache(maxsize=4096)
 def described(
     pointer: int, shape: tuple[int, ...], strides: tuple[int, ...], dtype: str
 ) -> tuple[str, Words]:

@@ -82,7 +82,7 @@ def _single(number: float) -> float:
 # within a factor of 2
 SQUARE = _single(0.5)
 # 1 + D [-]
-RANGE = _single(1.5)
+RANGE = _single(1 + SQUARE)
 # 2 s / (1 - s) [-]; with it a wall of a tenth of a cell bends 15 to 20% too little. A
 # power of 2 is exact in single precision.
 FULL = _single(1 / 256)

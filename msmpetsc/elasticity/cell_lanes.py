@@ -18,7 +18,6 @@ from msmpetsc.elasticity.assumed_strain import rest_constants
 from msmpetsc.elasticity.cell_blocks import PROJECTED, ROWS, STATE, CellBlocks
 from msmpetsc.elasticity.cell_strain import LANES, Eight, Strains, form_of, strain, write_forces
 from msmpetsc.elasticity.neo_hookean import (
-    QUADRATIC,
     cell_gradient,
     cell_product,
     determinant_and_change,
@@ -108,15 +107,6 @@ def add_product(blocks: CellBlocks, state: Rows, v: Rows, product: Rows) -> None
 
 
 @njit(fastmath=FAST, error_model="numpy")
-def _quadratic_gradient_lanes(w: Floats, h4: float) -> None:
-    for lane in range(LANES):
-        k, e = CONSTANTS + lane, _strains_in(w, lane)
-        rest, m, lame = rest_constants(w, k), w[k + 104], w[k + 112]
-        slopes, modes = cell_gradient(rest, m, lame, e, h4, QUADRATIC)
-        write_forces(w, RESULT + lane, form_of(w, k), slopes, modes)
-
-
-@njit(fastmath=FAST, error_model="numpy")
 def _gradient_lanes(w: Floats, h4: float, u: int) -> None:
     for lane in range(LANES):
         k, e = CONSTANTS + lane, _strains_in(w, lane)
@@ -131,11 +121,7 @@ def add_gradient(blocks: CellBlocks, q: Positions, gradient: Rows) -> None:
     for b in range(len(blocks.nodes)):
         _gather(blocks.nodes, b, q, w)
         _load(blocks.constants, blocks.which[b], w, CONSTANTS)
-        # The compiler vectorises the loop only if the volumetric energy is a constant
-        if blocks.u == QUADRATIC:
-            _quadratic_gradient_lanes(w, blocks.h4)
-        else:
-            _gradient_lanes(w, blocks.h4, blocks.u)
+        _gradient_lanes(w, blocks.h4, blocks.u)
         _scatter(blocks.nodes, b, w, gradient)
 
 

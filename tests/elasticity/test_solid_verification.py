@@ -2,11 +2,7 @@
 
 import numpy as np
 import pytest
-import small_strain
 import solid_runs as study
-from skfem.models.elasticity import lame_parameters
-
-from msmpetsc.elasticity.energy import Elasticity
 
 
 @pytest.mark.parametrize(("poisson", "iterations"), [(0.25, 35), (0.49, 50), (0.4999, 70)])
@@ -50,36 +46,3 @@ def test_statics_find_one_state_wherever_a_bar_starts(poisson: float, start: str
     assert (
         of.iterations < (60 if start.startswith("pressed") else 300) and of.frames[-1].inverted == 0
     )
-
-
-def textbook(F: np.ndarray, poisson: float) -> np.ndarray:
-    """Return P = mu (F - F^-T) + lambda (J - 1) J F^-T [Pa]."""
-    lame, mu = lame_parameters(small_strain.E, poisson)
-    J, inverse = np.linalg.det(F), np.linalg.inv(F).T
-    return mu * (F - inverse) + lame * (J - 1) * J * inverse
-
-
-STRAINS = [
-    F
-    for s in (0.5, 1.5)
-    for F in (np.diag([s, 1, 1]), np.diag([s, s, 1]), np.array([[1, s, 0], [0, 1, 0], [0, 0, 1]]))
-]
-
-
-@pytest.mark.parametrize("poisson", study.POISSON)
-def test_the_forces_are_the_textbooks(poisson: float):
-    """Forces equal P n on the faces of a block, half of it at edges, and zero inside."""
-    h, cells = 0.125, (4, 3, 2)
-    lattice = small_strain.box(cells, h, poisson)
-    sides = h * np.array(cells)
-    for F in STRAINS:
-        force, exact = np.zeros((2, *lattice.nodes.shape))
-        Elasticity(lattice).add_gradient(lattice.nodes @ F.T, force)
-        P = textbook(F, poisson)
-        for axis in range(3):
-            rest, end = (np.delete(of, axis, axis=-1) for of in (lattice.nodes, sides))
-            part = np.where(np.isclose(rest, 0) | np.isclose(rest, end), 0.5, 1).prod(axis=1)
-            for sign, at in ((-1, 0), (1, sides[axis])):
-                on = np.isclose(lattice.nodes[:, axis], at)
-                exact[on] += sign * h**2 * part[on, None] * P[:, axis]
-        assert np.abs(force - exact).max() < 1e-11 * np.abs(exact).max(), F

@@ -18,10 +18,6 @@ RNG = np.random.default_rng(31)
 STATIC = {"time": {"integrator": "static"}, "output": {"surface": False, "stress": True}}
 
 
-def of_law(poisson: float, young: float = 1e5) -> dict:
-    return solid_of(young, poisson)
-
-
 def at_rest(path: Path, *overrides: str) -> tuple[Model, Frame]:
     model, frames = play(path, *overrides)
     return model, frames[-1]
@@ -87,7 +83,7 @@ def test_the_stress_of_a_collapsed_cell_is_finite():
 def test_a_bar_in_tension_has_force_over_area(tmp_path):
     """The stress of a bar in tension is the force over the deformed area."""
     scene = block_scene(
-        tmp_path, np.array([1.0, 0.25, 0.25]), **STATIC, material=of_law(0.3),
+        tmp_path, np.array([1.0, 0.25, 0.25]), **STATIC, material=solid_of(1e5, 0.3),
         pin=[{"region": along_x(-0.01, 0.01)}],
         force=[{"region": along_x(0.99, 1.01), "total": [1000.0, 0, 0]}],
     )  # fmt: skip
@@ -106,7 +102,7 @@ def test_a_beam_in_bending_has_the_moment_times_the_height_over_i(tmp_path):
     """Stresses in the middle third of a cantilever are M z / I at the cells' middles."""
     length, depth, width, pull = 4.0, 0.5, 0.25, -0.1
     scene = block_scene(
-        tmp_path, np.array([length, width, depth]), **STATIC, material=of_law(0.25),
+        tmp_path, np.array([length, width, depth]), **STATIC, material=solid_of(1e5, 0.25),
         pin=[{"region": along_x(-0.01, 0.01)}],
         force=[{"region": along_x(3.99, 4.01), "total": [0, 0, pull]}],
     )  # fmt: skip
@@ -133,7 +129,7 @@ def test_both_sides_of_a_slit_have_their_own_stress(tmp_path):
     slit = trimesh.creation.box(bounds=gap)
     fork = trimesh.boolean.difference([bar, slit], engine="manifold").apply_scale(CELL)
     scene = block_scene(
-        tmp_path, **STATIC, material=of_law(0.3), pin=[{"region": along_x(-0.01, 0.01)}],
+        tmp_path, **STATIC, material=solid_of(1e5, 0.3), pin=[{"region": along_x(-0.01, 0.01)}],
         force=[{"region": {"box": [[0.9, -1, 0.4], [2, 1, 1]]}, "total": [0, 0, 0.5]}],
     )  # fmt: skip
     fork.export(tmp_path / "scene.ply")

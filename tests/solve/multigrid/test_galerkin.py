@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hierarchies import COMM, LATTICES, SHAPES, Case, build, heavier, hierarchy
+from hierarchies import COMM, LATTICES, SHAPES, Case, build, hierarchy
 from lattices import block
 
 from msmpetsc.solve.multigrid.coarse_products import CoarseOperator
@@ -17,12 +17,7 @@ CASES = {
     "many": ("many bodies", "twisted", True, {}),
     "thin": ("thin sheet", "twisted", False, {"pins": True}),
     "solid": ("block that begins at odd indices", "twisted", True, {"poisson": 0.45, "pins": True}),
-    "solid, crushed, touching, of two materials": (
-        "limbs",
-        "crushed",
-        True,
-        {"poisson": 0.49, "contrast": 1e3},
-    ),
+    "solid, crushed": ("limbs", "crushed", True, {"poisson": 0.49, "contrast": 1e3}),
 }
 
 
@@ -85,37 +80,21 @@ def test_levels_are_galerkin_products(name: str):
         # each body is a single cell, so no grid is coarser
         assert len(case.multigrid.levels) > 1 or name == "many"
         check_levels(case)
-        np.testing.assert_allclose(case.dense(lambda x, y: case.multigrid.fine.mult(None, x, y)),
-        case.hessian(),
-                                   rtol=0, atol=1e-5 * np.abs(case.hessian()).max())  # fmt: skip
-
-
-@pytest.mark.parametrize("mass", [1e-9, 1e9])
-@pytest.mark.parametrize("name", LATTICES)
-def test_levels_of_light_and_heavy_bodies(name: str, mass: float):
-    with hierarchy(
-        COMM, heavier(build(COMM, LATTICES[name]), mass), SHAPES["twisted"], coarsest=10
-    ) as case:
-        check_levels(case)
+        finest = case.dense(lambda x, y: case.multigrid.fine.mult(None, x, y))
+        exact = case.hessian()
+        np.testing.assert_allclose(finest, exact, rtol=0, atol=1e-5 * np.abs(exact).max())
 
 
 def test_a_new_hierarchy_takes_nothing_of_the_old_one():
     """A new hierarchy takes over neither positions, nor contact, nor entries of matrices."""
-    with hierarchy(
-        COMM,
-        build(COMM, LATTICES["limbs"], pins=True),
-        SHAPES["crushed"],
-        contact=True,
-        coarsest=10,
-    ) as case:
+    lattice = build(COMM, LATTICES["limbs"], pins=True)
+    with hierarchy(COMM, lattice, SHAPES["crushed"], contact=True, coarsest=10) as case:
         check_levels(case)
         case.q, case.blocks = SHAPES["twisted"](case.lattice.nodes), np.empty((0, 9))
         case.multigrid.update(case.q, case.blocks)
         check_levels(case)
         again = case.cycle()
-    with hierarchy(
-        COMM, build(COMM, LATTICES["limbs"], pins=True), SHAPES["twisted"], coarsest=10
-    ) as case:
+    with hierarchy(COMM, lattice, SHAPES["twisted"], coarsest=10) as case:
         np.testing.assert_array_equal(case.cycle(), again)
 
 

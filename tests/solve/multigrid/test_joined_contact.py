@@ -70,12 +70,7 @@ def test_the_stiff_points_and_the_others_are_the_whole_less_what_joins_both(
     assert np.abs(joined(stiff)).max() > 1e3 * np.abs(joined(others)).max()
     # only the stiffest contact
     one, rest = surface.split(compliance, 1)
-    assert (
-        one is not None
-        and rest is not None
-        and one.points.shape == (3, 3)
-        and rest.points.shape == (18, 18)
-    )
+    assert one.points.shape == (3, 3) and rest.points.shape == (18, 18)
     assert surface.split(1e-12 * compliance, POINTS)[0] is None
 
 

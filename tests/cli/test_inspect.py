@@ -91,17 +91,17 @@ def test_what_is_scaled_is_near_what_is_counted(scene: Path):
 def test_a_lattice_too_large_for_petsc_is_refused(scene: Path, monkeypatch):
     lattice = build_model(SELF, load_scene(scene)).lattice
     nodes, nonzeros = lattice.owned, lattice.owned + 2 * len(lattice.springs)
-    monkeypatch.setattr("msmpetsc.solve.linear.unknowns.LARGEST", 3 * nodes - 1)
+    monkeypatch.setattr("msmpetsc.solve.petsc.library.LARGEST", 3 * nodes - 1)
     for holder in (Unknowns, Ghosted.of):
         with pytest.raises(
             InputError, match=f"{nodes} nodes are more than the {3 * nodes - 1} unknowns"
         ):
             holder(SELF, lattice)
-    monkeypatch.setattr("msmpetsc.solve.linear.unknowns.LARGEST", nonzeros - 1)
+    monkeypatch.setattr("msmpetsc.solve.petsc.library.LARGEST", nonzeros - 1)
     unknowns = Unknowns(SELF, lattice)
     with pytest.raises(InputError, match=f"{nonzeros} nonzeros"):
         assemble(SELF, unknowns, 0.01)
-    monkeypatch.setattr("msmpetsc.solve.linear.unknowns.LARGEST", nonzeros)
+    monkeypatch.setattr("msmpetsc.solve.petsc.library.LARGEST", nonzeros)
     assemble(SELF, unknowns, 0.01).destroy()
 
 

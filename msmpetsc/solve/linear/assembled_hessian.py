@@ -19,8 +19,8 @@ from msmpetsc.elasticity.pressure import PressureHessian
 from msmpetsc.elasticity.solid import CellHessians
 from msmpetsc.elasticity.springs import Springs, elastic_hessian
 from msmpetsc.solve.linear.operators import TrueHessian
-from msmpetsc.solve.linear.unknowns import Unknowns, refuse_nonzeros
-from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo
+from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.petsc.library import preallocate_coo, refuse_nonzeros, set_values_coo
 
 
 class HessianBlocks(NamedTuple):

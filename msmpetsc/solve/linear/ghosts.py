@@ -6,9 +6,9 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Array, Indices
 from msmpetsc.lattice.lattice import Lattice
-from msmpetsc.solve.linear.unknowns import refuse_unknowns
 from msmpetsc.solve.petsc.device import memory_of
 from msmpetsc.solve.petsc.events import GHOSTS
+from msmpetsc.solve.petsc.library import refuse_unknowns
 
 
 def local_numbers(columns: Indices, first: int, owned: int) -> tuple[Indices, Indices]:

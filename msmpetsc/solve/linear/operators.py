@@ -15,10 +15,10 @@ from msmpetsc.contact.surface.surface_contact import SurfaceHessian
 from msmpetsc.elasticity.energy import Elasticity, Hessian
 from msmpetsc.elasticity.solid import CellHessians
 from msmpetsc.errors import InputError
-from msmpetsc.solve.linear.unknowns import Unknowns, refuse_nonzeros
+from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.petsc.device import Memory
 from msmpetsc.solve.petsc.events import CONTACT, HESSIAN, PRODUCT
-from msmpetsc.solve.petsc.library import petsc_csr
+from msmpetsc.solve.petsc.library import petsc_csr, refuse_nonzeros
 
 
 class Block:

@@ -1,4 +1,4 @@
-"""Numbering of the unknowns by nodes and coordinates, and ghost exchange of nodal values.
+"""Numbering of the unknowns by nodes and coordinates.
 
 Pinned nodes are not unknowns. A node that is fixed in part (a roller) is an unknown. Its fixed
 components are zero in each vector of unknowns, and no operator or preconditioner changes them. On
@@ -16,20 +16,17 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, like, to_host
 from msmpetsc.backend.kernel import kernel
 from msmpetsc.comm import reduced
-from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
+from msmpetsc.solve.linear.ghosts import Ghosted
 from msmpetsc.solve.petsc.device import memory_of
-from msmpetsc.solve.petsc.events import GHOSTS
+from msmpetsc.solve.petsc.library import refuse_unknowns
 
-# largest integer of PETSc; its configuration decides between 32 and 64 bits
-LARGEST = int(np.iinfo(PETSc.IntType).max)
-ADVICE = "a PETSc configured with --with-64-bit-indices can"
 # inertia of static nodes in multigrid [mass]; a flat cell has a singular block
 BALLAST = 1e-6
 
 
 class Unknowns:
-    """Number the free nodes of a lattice over all ranks, and exchange their ghosts.
+    """Number the free nodes of a lattice over all ranks.
 
     free    : (m,) local numbers of the free owned nodes
     numbers : (l,) global number of each local node among the free nodes, -1 if pinned
@@ -60,26 +57,13 @@ class Unknowns:
         node, component = (to_host(rows[self.rollers[0] < lattice.owned]) for rows in self.rollers)
         self._roller_rows = like(self.free, component * self.size + own[node] - first)
         self.numbers = lattice.table.with_ghosts(lattice.ghosts, own)
-        index = np.stack([3 * first + own - first + c * self.size for c in range(3)], axis=1)
-        free_ghosts = lattice.owned + np.flatnonzero(self.numbers[lattice.owned :] >= 0)
-        self.free_ghosts = like(self.free, free_ghosts)
-        # whether any rank has ghosts
-        self.has_ghosts = reduced(comm, len(free_ghosts)) > 0
-        sources = lattice.table.with_ghosts(lattice.ghosts, index)[free_ghosts].ravel()
-        self.ghost_values = self._vector(PETSc.COMM_SELF, len(sources))
-        vector = self.create_vector()
-        index = PETSc.IS().createGeneral(sources.astype(PETSc.IntType), comm=comm)
-        self.scatter = PETSc.Scatter().create(vector, index, self.ghost_values, None)
-        index.destroy()
-        vector.destroy()
+        any_ghosts = reduced(comm, len(lattice.ghosts)) > 0
+        self._ghosted = Ghosted.of(comm, lattice) if any_ghosts else None
 
     def create_vector(self) -> PETSc.Vec:
         """Return a new vector of unknowns (collective)."""
-        return self._vector(self.comm, (3 * self.size, 3 * self.total))
-
-    def _vector(self, comm: MPI.Comm, sizes: int | tuple[int, int]) -> PETSc.Vec:
-        vector = PETSc.Vec().create(comm)
-        vector.setSizes(sizes)
+        vector = PETSc.Vec().create(self.comm)
+        vector.setSizes((3 * self.size, 3 * self.total))
         vector.setType(self.memory.vec_type)
         return vector
 
@@ -97,12 +81,12 @@ class Unknowns:
         Fixed components keep their values.
         """
         kept = nodes[self.rollers]
-        if self.has_ghosts:
-            with GHOSTS:
-                self.scatter.scatter(vector, self.ghost_values)
         _spread(self.size, self.columns(vector), self.free, nodes)
-        if len(self.free_ghosts):
-            nodes[self.free_ghosts] = self.memory.read(self.ghost_values).reshape(-1, 3)
+        if self._ghosted:
+            values, owned = self._ghosted.values, self.lattice.owned
+            values[:owned] = nodes[:owned]
+            self._ghosted.update()
+            nodes[owned:] = values[owned:]
         nodes[self.rollers] = kept
 
     def from_nodes(self, nodes: Positions, vector: PETSc.Vec) -> None:
@@ -133,8 +117,8 @@ class Unknowns:
 
     def destroy(self) -> None:
         """Destroy all PETSc objects (collective)."""
-        self.scatter.destroy()
-        self.ghost_values.destroy()
+        if self._ghosted:
+            self._ghosted.destroy()
 
 
 class VectorPool:
@@ -168,28 +152,6 @@ class VectorPool:
         """Destroy all vectors of the pool (collective)."""
         for vector in self._all:
             vector.destroy()
-
-
-def refuse_unknowns(nodes: int) -> None:
-    """Raise InputError if PETSc cannot number the three coordinates of so many nodes."""
-    if 3 * nodes > LARGEST:
-        most = f"the {LARGEST} unknowns that PETSc can number here"
-        raise InputError(
-            f"cages: the three coordinates of {nodes} nodes are more than {most}; {ADVICE}"
-        )
-
-
-def refuse_nonzeros(comm: MPI.Comm, own: int) -> None:
-    """Raise InputError if a rank has more nonzeros than PETSc can count (collective).
-
-    own : number of nonzeros of this rank
-    """
-    most = reduced(comm, own, MPI.MAX)
-    if most > LARGEST:
-        raise InputError(
-            f"cages: {most} nonzeros of the system matrix on one rank are more than the {LARGEST} "
-            f"that PETSc can count here; more ranks have fewer each, or {ADVICE}"
-        )
 
 
 @kernel

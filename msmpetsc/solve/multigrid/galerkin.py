@@ -34,10 +34,10 @@ from msmpetsc.elasticity.springs import SYMMETRIC, Springs, spring_block
 from msmpetsc.elasticity.vectors import Three, cofactors, combined, cross, scaled
 from msmpetsc.geometry.grid import CORNERS
 from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
-from msmpetsc.solve.linear.unknowns import Unknowns, refuse_nonzeros
+from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.coarse_copies import DIGITS, MOST_COPIES, in_cells
 from msmpetsc.solve.multigrid.grids import CoarseGrid
-from msmpetsc.solve.petsc.library import preallocate_coo, set_values_coo
+from msmpetsc.solve.petsc.library import preallocate_coo, refuse_nonzeros, set_values_coo
 
 # code of a pinned node; a node at (i, j, k) in its coarse cell has the code
 # 9 i + 3 j + k

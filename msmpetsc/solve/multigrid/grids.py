@@ -15,8 +15,9 @@ from msmpetsc.backend.arrays import Array, Indices, Mask
 from msmpetsc.geometry.grid import CORNERS
 from msmpetsc.geometry.morton import decode_morton, encode_morton
 from msmpetsc.geometry.partition import SortedKeys
-from msmpetsc.solve.linear.unknowns import Unknowns, refuse_unknowns
+from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.coarse_copies import CoarseCopies
+from msmpetsc.solve.petsc.library import refuse_unknowns
 
 # greatest number of nodes of a coarse grid [nodes of the finer grid]; a larger grid
 # does not pay

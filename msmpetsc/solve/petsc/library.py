@@ -9,12 +9,17 @@ from functools import cache
 from typing import Protocol
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import Array, Floats, Indices
+from msmpetsc.comm import reduced
 from msmpetsc.errors import InputError, did_you_mean
 
+# largest integer of PETSc; its configuration decides between 32 and 64 bits
+LARGEST = int(np.iinfo(PETSc.IntType).max)
+ADVICE = "a PETSc configured with --with-64-bit-indices can"
 Integer = ctypes.c_int64 if PETSc.IntType().itemsize == 8 else ctypes.c_int32
 INSERT = int(PETSc.InsertMode.INSERT_VALUES)
 
@@ -27,6 +32,28 @@ def petsc_library() -> ctypes.CDLL:
     """
     # petsc4py's extension module also exports the symbols of libpetsc.
     return ctypes.PyDLL(PETSc.__file__)
+
+
+def refuse_unknowns(nodes: int) -> None:
+    """Raise InputError if PETSc cannot number the three coordinates of so many nodes."""
+    if 3 * nodes > LARGEST:
+        most = f"the {LARGEST} unknowns that PETSc can number here"
+        raise InputError(
+            f"cages: the three coordinates of {nodes} nodes are more than {most}; {ADVICE}"
+        )
+
+
+def refuse_nonzeros(comm: MPI.Comm, own: int) -> None:
+    """Raise InputError if a rank has more nonzeros than PETSc can count (collective).
+
+    own : number of nonzeros of this rank
+    """
+    most = reduced(comm, own, MPI.MAX)
+    if most > LARGEST:
+        raise InputError(
+            f"cages: {most} nonzeros of the system matrix on one rank are more than the {LARGEST} "
+            f"that PETSc can count here; more ranks have fewer each, or {ADVICE}"
+        )
 
 
 def total_iterations(ksp: PETSc.KSP) -> int:

@@ -92,13 +92,6 @@ class ProjectedHessian:
                 self.joined.add_product(self.v, self.product)
             self.unknowns.scaled_sum(self.v, self.t2, self.product, y)
 
-    def by_blocks(self, x: Rows, y: Rows) -> Rows:
-        """Write (D + C)^-1 x (3, m) to y, with surface contact C, and return y."""
-        apply_blocks(self.unknowns.size, x, self.inverse, y)
-        if self.smoother:
-            self.smoother.correct(y)
-        return y
-
 
 class DiagonalBlocks:
     """Apply the inverse of D + C, the finest level's blocks and surface contact (for PCPYTHON)."""
@@ -107,8 +100,11 @@ class DiagonalBlocks:
         self.hessian = hessian
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        unknowns = self.hessian.unknowns
-        self.hessian.by_blocks(unknowns.columns(x), unknowns.columns_to_write(y))
+        unknowns, smoother = self.hessian.unknowns, self.hessian.smoother
+        columns = unknowns.columns_to_write(y)
+        apply_blocks(unknowns.size, unknowns.columns(x), self.hessian.inverse, columns)
+        if smoother:
+            smoother.correct(columns)
 
     def view(self, _: PETSc.PC, viewer: PETSc.Viewer) -> None:
         viewer.printfASCII("  the 3 x 3 blocks of each node, inverted\n")

@@ -7,7 +7,6 @@ move together. Diagonal blocks represent neither, because they act as springs to
 from itertools import zip_longest
 
 import numpy as np
-from petsc4py import PETSc
 from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dpstrf
 from scipy.sparse import csr_array, eye_array, kron
@@ -17,7 +16,6 @@ from msmpetsc.comm import reduced
 from msmpetsc.contact.surface.surface_contact import SurfaceHessian
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.interpolation import Interpolation
-from msmpetsc.solve.petsc.library import set_up_aij
 
 
 class ContactSmoother:
@@ -74,52 +72,28 @@ def root_of(matrix: Rows) -> Rows:
     return root
 
 
-class CoarseContact:
-    """Add contact C = t^2 (W P)^T H_c (W P) to coarse levels. All methods are collective.
+def coarse_contact(
+    weights: csr_array,
+    surface: SurfaceHessian,
+    interpolations: list[Interpolation],
+    t2: float,
+    blocks: list[Rows],
+) -> csr_array:
+    """Return this rank's rows of contact C = t^2 (W P)^T H_c (W P) on the coarsest level.
 
-    The coarsest matrix gets all of C. The levels between the finest and the coarsest get only the
-    diagonal blocks of C, so that their nonzeros do not change.
+    The levels between the finest and the coarsest get only the diagonal blocks of C, so that their
+    nonzeros do not change. The function is collective.
 
+    weights        : W of the free nodes
     interpolations : P from each coarse level to the next finer level
-    coarsest       : coarsest matrix with contact; None before the first contact
+    blocks         : diagonal blocks (n, 9) of each level except the coarsest, to which C is added
     """
-
-    def __init__(self, unknowns: Unknowns, interpolations: list[Interpolation], t2: float):
-        self.unknowns, self.interpolations, self.t2 = unknowns, interpolations, t2
-        self.coarsest: PETSc.Mat | None = None
-
-    def added(
-        self, coarsest: PETSc.Mat, blocks: list[Rows], surface: SurfaceHessian | None
-    ) -> PETSc.Mat:
-        """Return a copy of the coarsest matrix with contact, or the matrix itself without contact.
-
-        blocks : diagonal blocks (n, 9) of each level except the coarsest, to which contact is added
-        """
-        if surface is None:
-            return coarsest
-        weights = surface.weights[:, self.unknowns.free]
-        for p, diagonal in zip_longest(self.interpolations, blocks):
-            # The order of the ranks makes the sum reproducible.
-            whole = sum(surface.comm.allgather(weights @ p.rows()))
-            count = coarsest.getLocalSize()[0] // 3 if diagonal is None else len(diagonal)
-            first = surface.comm.exscan(count) or 0  # type: ignore[attr-defined]
-            weights = csr_array(whole[:, first : first + count])
-            if diagonal is not None:
-                own = SurfaceHessian(surface.comm, weights, surface.points)
-                diagonal += self.t2 * own.blocks
-        joined = kron(weights, eye_array(3), "csr").T @ (
-            surface.points @ kron(whole, eye_array(3), "csr")
-        )
-        contact = PETSc.Mat().create(coarsest.comm)
-        set_up_aij(contact, coarsest.getSizes(), coarsest.getType(), self.t2 * csr_array(joined), 3)
-        self.destroy()
-        self.coarsest = coarsest.copy()
-        self.coarsest.axpy(1.0, contact, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-        contact.destroy()
-        return self.coarsest
-
-    def destroy(self) -> None:
-        """Destroy the coarsest matrix with contact (collective)."""
-        if self.coarsest:
-            self.coarsest.destroy()
-            self.coarsest = None
+    for p, diagonal in zip_longest(interpolations, blocks):
+        # The order of the ranks makes the sum reproducible.
+        whole = sum(surface.comm.allgather(weights @ p.rows()))
+        weights = csr_array(whole[:, p.first : p.first + p.own])
+        if diagonal is not None:
+            own = SurfaceHessian(surface.comm, weights, surface.points)
+            diagonal += t2 * own.blocks
+    wide = kron(whole, eye_array(3), "csr")
+    return csr_array(t2 * kron(weights, eye_array(3), "csr").T @ (surface.points @ wide))

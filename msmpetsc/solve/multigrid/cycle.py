@@ -19,7 +19,7 @@ from functools import cached_property
 
 import numpy as np
 from petsc4py import PETSc
-from scipy.sparse import bsr_array
+from scipy.sparse import bsr_array, csr_array
 
 from msmpetsc.backend.arrays import Indices, Positions, Rows, to_host
 from msmpetsc.comm import reduced
@@ -32,7 +32,7 @@ from msmpetsc.solve.linear.operators import python_matrix
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.coarse_copies import CoarseCopies
 from msmpetsc.solve.multigrid.coarse_products import CoarseOperator
-from msmpetsc.solve.multigrid.contact import CoarseContact
+from msmpetsc.solve.multigrid.contact import coarse_contact
 from msmpetsc.solve.multigrid.finest_level import DiagonalBlocks, ProjectedHessian
 from msmpetsc.solve.multigrid.free_bodies import bodies_of
 from msmpetsc.solve.multigrid.galerkin import GalerkinSum
@@ -76,7 +76,7 @@ class Level:
     scalar        : P (AIJ) of a single coordinate; None for the first coarse level
     pattern       : AIJ of the nodes, with an entry for each block of the level's matrix
     matrix        : the level's matrix (AIJ of block size 3), or its diagonal blocks alone if a
-                    CoarseOperator multiplies
+                    CoarseOperator multiplies; none on the coarsest level
     """
 
     grid: CoarseGrid
@@ -120,10 +120,6 @@ class Multigrid:
             raise
         self.coarse: list[CoarseOperator] = []
         self.bounds = [0.0] * len(self.levels)
-        self.contact = CoarseContact(
-            unknowns, [level.interpolation for level in self.levels], time_step**2
-        )
-        self.owned.callback(self.contact.destroy)
         self.coarsest = PETSc.Mat()
         self.owned.callback(self.coarsest.destroy)
         self.pc = PETSc.PC().create(unknowns.comm)
@@ -194,27 +190,23 @@ class Multigrid:
             self.coarse = [CoarseOperator(level.pattern) for level in self.levels[:-1]]
             for coarse in self.coarse:
                 self.owned.callback(coarse.operator.destroy)
-        for level, of_level in list(zip(self.levels, blocks, strict=True))[len(self.coarse) :]:
-            begin, columns, _ = level.pattern.getValuesCSR()
-            set_blocks(level.matrix, level.pattern, begin, columns, of_level)
         diagonals = [
             of_level[level.diagonal]
             for level, of_level in zip(self.levels, blocks[:-1], strict=False)
         ]
-        coarsest = self.contact.added(self.levels[-1].matrix, diagonals, joined)
-        for coarse, level, of_level, diagonal in zip(
-            self.coarse, self.levels, blocks, diagonals, strict=False
-        ):
+        added = self._contact_at(joined, diagonals) if joined else None
+        for i, (level, diagonal) in enumerate(zip(self.levels, diagonals, strict=False)):
+            begin, columns, _ = level.pattern.getValuesCSR()
+            of_level = blocks[i]
             of_level[level.diagonal] = diagonal
-            coarse.update(of_level)
-            own = level.grid.table.first + np.arange(len(diagonal))
-            set_blocks(level.matrix, level.pattern, np.arange(len(own) + 1), own, diagonal)
+            if self.coarse:
+                self.coarse[i].update(of_level)
+                columns = level.grid.table.first + np.arange(len(diagonal))
+                begin, of_level = np.arange(len(diagonal) + 1), diagonal
+            set_blocks(level.matrix, level.pattern, begin, columns, of_level)
+        self._set_coarsest(blocks[-1], added)
         if is_new:
             self._create_cycle()
-        self.coarsest.destroy()
-        # The LU factor in 3 x 3 blocks takes a third of the time of an AIJ's factor.
-        coarsest.convert(PETSc.Mat.Type.BAIJ, self.coarsest)
-        self.coarsest.setVecType(self.unknowns.memory.vec_type)
         self.pc.getMGCoarseSolve().setOperators(self.coarsest, self.coarsest)
         self.bounds[0] = self._finest_bound()
         for i, level in enumerate(self.levels[:-1], 1):
@@ -225,6 +217,26 @@ class Multigrid:
             set_chebyshev(self.pc.getMGSmoother(len(self.levels) - i), RANGE_START * bound, bound)
         if is_new:
             self._read_options()
+
+    def _contact_at(self, surface: SurfaceHessian, diagonals: list[Rows]) -> csr_array:
+        """Return contact on the coarsest level; add it to the diagonal blocks of other levels."""
+        weights, t2 = surface.weights[:, self.unknowns.free], self.fine.t2
+        interpolations = [level.interpolation for level in self.levels]
+        return coarse_contact(weights, surface, interpolations, t2, diagonals)
+
+    def _set_coarsest(self, blocks: Rows, contact: csr_array | None) -> None:
+        """Set the coarsest matrix to its blocks (k, 9), plus this rank's rows of contact."""
+        pattern, integer = self.levels[-1].pattern, PETSc.IntType
+        begin, columns, _ = pattern.getValuesCSR()
+        sizes = 3 * np.array(pattern.getSizes())
+        rows = bsr_array((blocks.reshape(-1, 3, 3), columns, begin), (sizes[0, 0], sizes[1, 1]))
+        if contact is not None:
+            rows = csr_array(rows + contact).tobsr((3, 3))
+        csr = rows.indptr.astype(integer), rows.indices.astype(integer), rows.data
+        self.coarsest.destroy()
+        # The LU factor in 3 x 3 blocks takes a third of the time of an AIJ's factor.
+        self.coarsest.createBAIJ(sizes, 3, csr=csr, comm=pattern.comm)
+        self.coarsest.setVecType(self.unknowns.memory.vec_type)
 
     @cached_property
     def sizes(self) -> list[tuple[int, int]]:
@@ -337,10 +349,10 @@ class Multigrid:
         for i, level in enumerate(self.levels):
             pc.setMGInterpolation(top - i, level.interpolation.operator)
             pc.setMGRestriction(top - i, self._restriction(level.interpolation))
-            ksp = pc.getMGSmoother(top - 1 - i) if i < top - 1 else pc.getMGCoarseSolve()
-            ksp.setOperators(
-                self.coarse[i].operator if i < len(self.coarse) else level.matrix, level.matrix
-            )
+        for i, level in enumerate(self.levels[:-1]):
+            ksp = pc.getMGSmoother(top - 1 - i)
+            operator = self.coarse[i].operator if self.coarse else level.matrix
+            ksp.setOperators(operator, level.matrix)
             ksp.getPC().setType(PETSc.PC.Type.PBJACOBI)
         finest = pc.getMGSmoother(top)
         finest.setOperators(self.operator, self.operator)

@@ -291,7 +291,6 @@ class LatticePreconditioner(StepPreconditioner):
     def forget(self) -> None:
         """Forget the hierarchy, so that the next step builds a new hierarchy."""
         self.is_stale = self.is_first = True
-        self.multigrid.contact.destroy()
 
     def destroy(self, _: PETSc.PC | None = None) -> None:
         self.multigrid.destroy()

@@ -8,12 +8,11 @@ import pytest
 import scipy.sparse as sparse
 from block_scene import play, solid_of
 from mpi4py import MPI
-from petsc4py import PETSc
 from pinch import pinch_scene
 
 from msmpetsc.contact.surface.surface_contact import SurfaceHessian
 from msmpetsc.solve.multigrid import cycle
-from msmpetsc.solve.multigrid.contact import CoarseContact, ContactSmoother
+from msmpetsc.solve.multigrid.contact import ContactSmoother, coarse_contact
 
 POINTS, NODES, T2 = 7, 12, 1e-3
 
@@ -74,30 +73,23 @@ def test_the_stiff_points_and_the_others_are_the_whole_less_what_joins_both(
     assert surface.split(1e-12 * compliance, POINTS)[0] is None
 
 
-def test_the_coarsest_matrix_has_the_whole_contact_and_finer_levels_their_blocks(
+def test_the_coarsest_level_has_the_whole_contact_and_finer_levels_their_blocks(
     surface: SurfaceHessian,
 ):
-    """Matrices equal P^T C P by dense products; a second contact replaces the first."""
+    """Contact equals P^T C P by dense products."""
     rng = np.random.default_rng(7)
     p = [rng.random((NODES, 6)), rng.random((6, 4))]
-    without = PETSc.Mat().createAIJ((12, 12), bsize=3, comm=MPI.COMM_SELF)
-    without.setUp()
-    without.setDiagonal(without.createVecRight() + 2.0)
-    unknowns = SimpleNamespace(free=np.arange(NODES))
-    rows = [SimpleNamespace(rows=lambda p=p: sparse.csr_array(p)) for p in p]
-    coarse = CoarseContact(unknowns, rows, T2)
-    for _ in range(2):
-        between = np.zeros((6, 9))
-        matrix = coarse.added(without, [between], surface)
-        first, second = (np.kron(whole, np.eye(3)) for whole in (p[0], p[0] @ p[1]))
-        expected = first.T @ joined(surface) @ first
-        blocks = expected.reshape(6, 3, 6, 3)[np.arange(6), :, np.arange(6)].reshape(6, 9)
-        np.testing.assert_allclose(between, blocks, rtol=1e-10)
-        expected = second.T @ joined(surface) @ second + 2 * np.eye(12)
-        np.testing.assert_allclose(matrix[:, :], expected, rtol=1e-10)
-        surface.points.data *= 0.5
-    coarse.destroy()
-    without.destroy()
+    interpolations = [
+        SimpleNamespace(rows=lambda p=p: sparse.csr_array(p), first=0, own=p.shape[1]) for p in p
+    ]
+    between = np.zeros((6, 9))
+    contact = coarse_contact(surface.weights, surface, interpolations, T2, [between])
+    first, second = (np.kron(whole, np.eye(3)) for whole in (p[0], p[0] @ p[1]))
+    expected = first.T @ joined(surface) @ first
+    blocks = expected.reshape(6, 3, 6, 3)[np.arange(6), :, np.arange(6)].reshape(6, 9)
+    np.testing.assert_allclose(between, blocks, rtol=1e-10)
+    expected = second.T @ joined(surface) @ second
+    np.testing.assert_allclose(contact.toarray(), expected, rtol=1e-10)
 
 
 SOLID = solid_of(1e5)

@@ -170,8 +170,11 @@ def repair(surface: Surface) -> Surface:
 
 
 @about_middle
-def simplify(surface: Surface, faces: int) -> Surface:
-    """Reduce to about ``faces`` triangles (quadric decimation); a closed surface stays closed."""
+def simplify(surface: Surface, faces: int, aggressiveness: int = 7) -> Surface:
+    """Reduce to about ``faces`` triangles (quadric decimation); a closed surface stays closed.
+
+    aggressiveness : of fast_simplification; less is slower and stays closer to the surface
+    """
     surface = merge(surface)
     if faces >= len(surface.triangles):
         return surface
@@ -179,7 +182,7 @@ def simplify(surface: Surface, faces: int) -> Surface:
     import fast_simplification
 
     points, triangles = fast_simplification.simplify(
-        surface.points, surface.triangles, target_count=int(faces)
+        surface.points, surface.triangles, target_count=int(faces), agg=aggressiveness
     )
     reduced = Surface(np.asarray(points, np.float64), np.asarray(triangles, np.int64))
     used, _ = edge_use(merged_triangles(reduced))

@@ -116,8 +116,12 @@ class Layout:
         """Return the first dataset that a file lacks or has in another form; None if all fit."""
         for plan in self.plans():
             dataset = file.get(plan.name)
-            wanted = plan.shape, np.dtype(plan.dtype)
-            if dataset is None or (dataset.shape, dataset.dtype) != wanted:
+            wanted = plan.shape, np.dtype(plan.dtype), plan.chunks
+            if dataset is None or (dataset.shape, dataset.dtype, dataset.chunks) != wanted:
+                return plan.name
+            # a copy of the file may be compressed or lack the space of chunks
+            dcpl = dataset.id.get_create_plist()
+            if dcpl.get_nfilters() or dcpl.get_alloc_time() != h5py.h5d.ALLOC_TIME_EARLY:
                 return plan.name
         names = file["checkpoint/numbers"].attrs["names"] if self.numbers else ""
         return None if names == " ".join(self.numbers) else "checkpoint/numbers"

@@ -342,6 +342,32 @@ def test_numbers_of_another_version_are_not_written_over(stopped: Path, capsys):
     assert "has no room for checkpoint/numbers as it is now: --force" in capsys.readouterr().err
 
 
+def rewritten(path: Path, name: str, **layout) -> bytes:
+    """Lay out a dataset anew, as h5repack does; return the bytes of the file."""
+    with h5py.File(path, "r+") as file:
+        values, units = file[name][...], file[name].attrs["units"]
+        del file[name]
+        file.create_dataset(name, data=values, **layout).attrs["units"] = units
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("name", ["frames/position", "frames/momentum"])
+@pytest.mark.parametrize("layout", [{"compression": "gzip"}, {}])
+def test_a_compressed_copy_is_written_anew_only(
+    whole: Path, stopped: Path, capsys, name: str, layout: dict
+):
+    """Raw numbers in compressed chunks would destroy all finished frames."""
+    if layout:
+        with h5py.File(stopped) as file:
+            layout = layout | {"chunks": file[name].chunks}
+    before = rewritten(stopped, name, **layout)
+    assert status_of("run", "--resume", stopped) == 2
+    assert f"has no room for {name} as it is now: --force" in capsys.readouterr().err
+    assert stopped.read_bytes() == before
+    assert status_of("run", "--resume", stopped, "--force") == 0
+    assert_same(stopped, whole)
+
+
 def test_a_run_cannot_end_before_its_checkpoint(stopped: Path, capsys):
     before = stopped.read_bytes()
     refused = "has come to step 10 already: it cannot end at step 10"

@@ -79,8 +79,10 @@ def plain_damage(path: Path) -> Iterator[None]:
     except PermissionError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from error
     except KeyError as error:
-        missing = printable(str(error.args[0]), 40)
-        raise InputError(f"{path} is damaged: it has no {missing}") from error
+        # HDF5 tells a damaged object in a sentence
+        reason = printable(str(error.args[0]))
+        told = " or cut short: " if " " in reason else ": it has no "
+        raise InputError(f"{path} is damaged{told}{reason}") from error
     except (
         OSError,
         RuntimeError,

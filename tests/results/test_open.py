@@ -188,6 +188,19 @@ def cut(part: float) -> Callable[[Path], None]:
     return lambda path: path.write_bytes(path.read_bytes()[: int(part * path.stat().st_size)])
 
 
+def without_header(name: str) -> Callable[[Path], None]:
+    """Return the damage of a file that lost the header of a group or dataset."""
+
+    def apply(path: Path) -> None:
+        with h5py.File(path) as file:
+            place = h5py.h5o.get_info(file[name].id).addr
+        with path.open("r+b") as data:
+            data.seek(place)
+            data.write(bytes(64))
+
+    return apply
+
+
 HUGE = dict(shape=(10**12,), dtype="f8", chunks=(1000,))
 BAD = {
     "cut in half": (cut(0.5), "is damaged or cut short: .*truncated"),
@@ -197,6 +210,7 @@ BAD = {
     "foreign": (lambda path: h5py.File(path, "w").close(), "is not a result of msmpetsc run"),
     "newer": (attribute("format_version", 2), "format_version 2; 1 is read here"),
     "no frames": (damage(lambda file: file.__delitem__("frames")), "no dataset frames/time"),
+    "no header": (without_header("frames"), "is damaged or cut short: Unable to"),
     "no time": (replaced("frames/time"), "no dataset frames/time"),
     "no nodes": (replaced("lattice/nodes"), "no dataset lattice/nodes"),
     "10^12 nodes": (

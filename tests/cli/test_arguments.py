@@ -93,6 +93,7 @@ TOO_MUCH = {
         "--ranks must be at most 1000000",
     ),
     "part": (["study", "study.toml", "--part", "1/" + "9" * 5000], "--part must read I/N"),
+    "listed part": (["study", "study.toml", "--list", "--part", "1/2"], "leave out --part"),
     "frames": (
         ["run", "scene.toml", "--checkpoint-every", "9" * 5000],
         "--checkpoint-every: invalid int value",

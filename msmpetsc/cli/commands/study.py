@@ -17,6 +17,8 @@ def run(args: argparse.Namespace) -> int:
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file, not a folder")
     if args.list:
+        if part:
+            raise InputError("--list lists the cases of all parts: leave out --part")
         listed = list_study(args.study, folder, args.full)
         # if N is the number of cases, --part I/N runs the case of number I
         for number, (case, done) in enumerate(listed, 1):

@@ -29,17 +29,18 @@ from numba.core.serialize import dumps
 import msmpetsc
 
 PACKAGE = Path(msmpetsc.__file__).parent
+# size of a test file [byte]; a full disk may still accept a few bytes
+PROBE = 1 << 16
 # size of the digest at the start of a file [byte]; it detects damaged files
 CHECK = hashlib.sha256().digest_size
 
 
 def _digest_of_sources() -> str:
-    """Return a digest of sources with kernels or named tuples, and of the compilers' versions."""
+    """Return a digest of all sources with kernels and of the compilers' versions."""
     sources = [path.read_bytes() for path in sorted(PACKAGE.rglob("*.py"))]
-    marks = b"njit", b"@kernel", b"NamedTuple"
-    read = [source for source in sources if any(mark in source for mark in marks)]
+    kernels = [source for source in sources if b"njit" in source or b"@kernel" in source]
     versions = f"{msmpetsc.__version__} {numba.__version__} {sys.implementation.cache_tag}"
-    return hashlib.sha256(b"".join(read) + versions.encode()).hexdigest()[:16]
+    return hashlib.sha256(b"".join(kernels) + versions.encode()).hexdigest()[:16]
 
 
 # Computed before kernels are imported: if the package is updated during a run, kernels
@@ -66,8 +67,9 @@ def folders() -> tuple[list[Path], Path | None]:
         with suppress(OSError):
             folder.mkdir(0o755, parents=True, exist_ok=True)
             readable.append(folder)
-            with tempfile.TemporaryFile(dir=folder):
-                return readable, folder
+            with tempfile.TemporaryFile(dir=folder) as file:
+                file.write(bytes(PROBE))
+            return readable, folder
     return readable, None
 
 
@@ -134,8 +136,18 @@ class KernelCache(NullCache):
 def key(function: Callable[..., Any], types: Iterable[Any], target: object) -> str:
     """Return the cache key of a function for argument types and a target processor."""
     constants = sorted(_constants(function).items())
-    name = function.__module__, function.__qualname__
-    return repr((name, target, [*map(str, types)], constants))
+    return repr(
+        (function.__module__, function.__qualname__, target, [*map(_described, types)], constants)
+    )
+
+
+def _described(kind: Any) -> tuple[Any, ...]:
+    """Return the name of a numba type, and the fields of named tuples, which the name lacks."""
+    return (
+        str(kind),
+        getattr(kind, "fields", ()),
+        [_described(item) for item in getattr(kind, "types", ())],
+    )
 
 
 @cache
@@ -148,5 +160,5 @@ def _constants(function: Callable[..., Any]) -> dict[str, bytes]:
             constants |= _constants(kernel)
         elif not isinstance(value, ModuleType):
             place = f"{function.__module__}.{function.__qualname__}.{name}"
-            constants[place] = pickle.dumps(value)
+            constants[place] = pickle.dumps((value, getattr(value, "_fields", ())))
     return constants

@@ -146,6 +146,8 @@ def test_a_disk_that_is_full_keeps_nothing(chosen: Path):
     try:
         resource.setrlimit(FILES, (0, most))
         kernel_cache.save("a", bytes(100))
+        kernel_cache.folders.cache_clear()
+        assert kernel_cache.writable() is None
     finally:
         resource.setrlimit(FILES, (most, most))
     assert kernel_cache.load("a") is None and [*chosen.iterdir()] == [stored]

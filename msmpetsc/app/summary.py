@@ -176,6 +176,9 @@ def refuse_unwritable(path: Path | None) -> None:
         with plain_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             TemporaryFile(dir=path.parent).close()
+            # a read-only file is not replaced
+            if path.exists():
+                open(path, "r+b").close()
 
 
 def versions() -> dict[str, str]:

@@ -4,6 +4,8 @@ Each ends with a line and status 2, and so do commands for a single process unde
 """
 
 import os
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -129,6 +131,18 @@ def test_no_format_is_written_under_the_name_of_another(folder, monkeypatch, arg
     before = {path: path.read_bytes() for path in folder.iterdir() if path.is_file()}
     assert words in command_error(*arguments)
     assert {path: path.read_bytes() for path in folder.iterdir() if path.is_file()} == before
+
+
+def test_a_cost_that_cannot_be_written_is_refused_before_the_run(folder: Path, tmp_path: Path):
+    """Nobody can write to a program that runs, not even root."""
+    cost = shutil.copy(shutil.which("sleep"), tmp_path / "cost.json")
+    command = "run", folder / "scene.toml", "-o", tmp_path / "x.h5", "--measure", cost
+    with subprocess.Popen([cost, "60"]) as program:
+        try:
+            assert f"{cost} cannot be written" in command_error(*command)
+        finally:
+            program.kill()
+    assert not (tmp_path / "x.h5").exists()
 
 
 ALONE = [["compare", "good.h5", "good.h5"], ["plan", "scene.toml", "--surface-error", "0.1"]]

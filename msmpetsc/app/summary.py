@@ -25,7 +25,7 @@ from msmpetsc.errors import StepFailed
 from msmpetsc.fields import Frame
 from msmpetsc.geometry.thickness import thickness_words
 from msmpetsc.lattice.material import STEPS_A_PERIOD, bending_period
-from msmpetsc.results.disk import plain_errors, write_whole
+from msmpetsc.results.disk import plain_errors, refuse_read_only, write_whole
 from msmpetsc.results.progress_bar import duration
 from msmpetsc.scene.reading import Scene
 from msmpetsc.solve.instrumentation import times
@@ -176,9 +176,7 @@ def refuse_unwritable(path: Path | None) -> None:
         with plain_errors(path):
             path.parent.mkdir(parents=True, exist_ok=True)
             TemporaryFile(dir=path.parent).close()
-            # a read-only file is not replaced
-            if path.exists():
-                open(path, "r+b").close()
+            refuse_read_only(path)
 
 
 def versions() -> dict[str, str]:

@@ -28,8 +28,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     with plain_errors(path):
         refuse_no_file(path)
         real.parent.mkdir(parents=True, exist_ok=True)
-        if real.exists():
-            open(real, "r+b").close()
+        refuse_read_only(real)
         with TemporaryDirectory(prefix=".part-", dir=real.parent) as folder:
             part = Path(folder, real.name)
             yield part
@@ -53,6 +52,12 @@ def refuse_no_file(path: Path) -> None:
         raise InputError(f"{path} is a folder, not a file")
     if path.exists() and not path.is_file():
         raise InputError(f"{path} is a pipe or a device, not a file")
+
+
+def refuse_read_only(path: Path) -> None:
+    """Raise OSError for an existing file that cannot be written."""
+    if path.exists():
+        open(path, "r+b").close()
 
 
 class Storage(io.FileIO):

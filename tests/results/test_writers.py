@@ -90,12 +90,23 @@ def writers(sources: Path) -> dict[str, Writer]:
     """Return the writers by names of their files."""
     bar, ball = sources / "bar.h5", sources / "ball.h5"
     to_plan = "[time] # mine\nstep = 0.1\nduration = 1.0\n"
-    from_pile = lambda path: new.run(parsed(["new", str(path), "--from", "pile"]))  # noqa: E731
     planned = tables(PlannedMethod("verlet"))
-    studied = lambda path: run_study(path.parent.with_name("asked.toml"), path.parent)  # noqa: E731
-    no_rows = lambda path: write_table(path.parent, [])  # noqa: E731
-    result = lambda path: small_result.write(path.with_suffix(".h5"))  # noqa: E731
-    xdmf = lambda path: write_xdmf(path.with_suffix(".h5"))  # noqa: E731
+
+    def from_pile(path: Path) -> None:
+        new.run(parsed(["new", str(path), "--from", "pile"]))
+
+    def studied(path: Path) -> None:
+        run_study(path.parent.with_name("asked.toml"), path.parent)
+
+    def no_rows(path: Path) -> None:
+        write_table(path.parent, [])
+
+    def result(path: Path) -> None:
+        small_result.write(path.with_suffix(".h5"))
+
+    def xdmf(path: Path) -> None:
+        write_xdmf(path.with_suffix(".h5"))
+
     table = {
         "x.h5": Writer("results/writer.py", small_result.write),
         "x.xdmf": Writer("results/xdmf.py", xdmf, result),
@@ -184,7 +195,6 @@ BY_HAND = re.compile(
 ALLOWED = {
     "results/disk.py": "the one way",
     "results/writer.py": "a result, which grows",
-    "app/summary.py": "asks before a run whether it could write",
     "export/formats.py": "under the name that the one way gave",
     "backend/kernel_cache.py": "a cache",
     "study/process.py": "the log of a child",

@@ -137,7 +137,10 @@ def sized(
     if not path.exists():
         path.write_text(SCENE)
     bench, said = Bodies(**bodies), []
-    distance = lambda a, b: bench.distance(bench.errors[a], bench.errors[b])  # noqa: E731
+
+    def distance(a: Path, b: Path) -> float:
+        return bench.distance(bench.errors[a], bench.errors[b])
+
     monkeypatch.setattr(trials, "surface_error", distance)
     asked = {"target": target, "frames": 10, "cells": cells, "advised": advised}
     return Sizer(path, bench, said.append, **asked).plan(), bench, said
@@ -222,7 +225,10 @@ def test_where_the_error_jumps_the_fewest_cells_beyond_are_taken(tmp_path: Path,
 
     No lattice has the error asked for, or slightly less.
     """
-    error = lambda self, method, cells: (1 if cells > 300 else 2) * cells**-0.5  # noqa: E731
+
+    def error(self: Bodies, method: PlannedMethod, cells: int) -> float:
+        return cells**-0.5 if cells > 300 else 2 * cells**-0.5
+
     monkeypatch.setattr(Bodies, "error_of", error)
     plan, *_ = sized(tmp_path, monkeypatch, 0.1)
     assert plan.met and 300 < plan.choice.cells < 330

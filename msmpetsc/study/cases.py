@@ -238,8 +238,9 @@ def _methods(base: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> It
 def _label(sweep: Sweep, case: Case) -> str:
     integrator = case.integrator.removeprefix("implicit-euler")
     name = sweep.label or " ".join(filter(None, (integrator, case.preset, case.options)))
-    vary = case.ranks != 1 and len(sweep.ranks) > 1
-    return f"{name}, {case.ranks} ranks" if vary else name
+    if case.ranks == 1 or len(sweep.ranks) == 1:
+        return name
+    return f"{name}, {case.ranks} ranks"
 
 
 def _timed(case: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> Case:
@@ -333,8 +334,10 @@ def map_points(map: Map) -> Iterator[tuple[float | None, float | str, MapCase]]:
     if map.x and map.y and map.file:
         for y, x in product(map.y.values, map.x.values):
             changes = (*map.set, *axis_changes(map.x, x, map), *axis_changes(map.y, y, map))
-            base = MapCase(name=map.name, file=map.file, steps=map.steps, set=changes)
-            yield x, y, base.model_copy(update={"duration": map.duration})
+            case = MapCase(
+                name=map.name, file=map.file, steps=map.steps, duration=map.duration, set=changes
+            )
+            yield x, y, case
 
 
 def axis_changes(axis: Axis, value: float, length: Length) -> Iterator[str]:

@@ -53,10 +53,10 @@ class Processes:
         if process is None:
             return Ended(None, "stopped")
         status: int | None = None
+        reason = ""
         try:
-            status = process.wait(timeout)
-            said = last_error(log.read_text(errors="replace")) if status else ""
-            reason = (said or f"exit status {status}") if status else ""
+            if status := process.wait(timeout):
+                reason = last_error(log.read_text(errors="replace")) or f"exit status {status}"
         except subprocess.TimeoutExpired:
             reason = too_long(timeout)
         finally:

@@ -5,7 +5,6 @@ The layout is in report.html.j2; this module computes the values that the templa
 
 import tomllib
 from datetime import datetime
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +37,15 @@ def write_report(folder: Path) -> Path:
     table = read_table(folder)
     file = folder / "study.toml"
     study = tomllib.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
-    sweeps, styles = swept(table), curve_styles(table["label"])
-    of_methods = (draw(sweeps, styles) for draw in (size_charts, pareto_charts, profile_charts))
-    charts = [*stability_charts(table, study), *chain(*of_methods), *growth_charts(sweeps)]
+    styles = curve_styles(table["label"])
+    sweeps = swept(table)
+    charts = [
+        *stability_charts(table, study),
+        *size_charts(sweeps, styles),
+        *pareto_charts(sweeps, styles),
+        *profile_charts(sweeps, styles),
+        *growth_charts(sweeps),
+    ]
     for chart in charts:
         save_png(chart, folder)
     title = str(study.get("title") or folder.resolve().name)
@@ -68,9 +73,13 @@ def page(title: str, date: str, table: DataFrame, charts: list[Chart]) -> str:
 def facts(table: DataFrame) -> dict[str, Any]:
     """Return the template's values: machines, versions, numbers of cases and of repeats."""
     plain = swept(table)
-    maps = {name: f"{len(of)}: {counted(of['outcome'])}" for name, of in mapped(table).items()}
-    texts = {name: filter(None, table[name].unique()) for name in ("machine", "versions")}
-    platforms = {name.capitalize(): [*of] for name, of in texts.items()}
+    maps = {
+        name: f"{len(rows)}: {counted(rows['outcome'])}" for name, rows in mapped(table).items()
+    }
+    platforms = {
+        name.capitalize(): [text for text in table[name].unique() if text]
+        for name in ("machine", "versions")
+    }
     counts = {"cases": len(plain), "failed": len(failed(plain)), "empty": table.empty}
     repeats = sorted(set(succeeded(plain)["repeats"].fillna(1).astype(int)))
     # empty if no case succeeded

@@ -212,7 +212,8 @@ class NodeObstacles:
         step  : the completed step, with the sides (o, l) for all obstacles
         fixed : (l, 3) bool, the components that are not free
         """
-        free, work = ~fixed, 0.0
+        free = ~fixed
+        work = 0.0
         sides = self.no_sides if step.sides is None else step.sides
         laws: list[Penalty | Exchange] = [*self.penalties, *self.exchanges]
         for law, side in zip(laws, sides, strict=True):

@@ -271,7 +271,8 @@ class ContactSearch:
 
     def nearest(self, q: Positions) -> str:
         """Return a text that names the two nearest parts of the surface at q, and their place."""
-        moment, words = self.find(q), ""
+        moment = self.find(q)
+        words = ""
         if self.barrier:
             points = self.barrier.nearest(moment.contacts, moment.points)
             names = dict.fromkeys(self.name_of(point) for point in points)

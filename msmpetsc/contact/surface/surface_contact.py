@@ -309,7 +309,8 @@ class SurfaceContact:
         projected : project the Hessian of each pair to be positive semidefinite
         duals     : (a, 3) duals of friction; None for the true Hessian of friction
         """
-        moment, known = self.contacts.find(q), self._hessians.get(projected)
+        moment = self.contacts.find(q)
+        known = self._hessians.get(projected)
         if not (moment.count or self.has_friction):
             return None
         if known is None or known[0] is not moment or known[1] is not duals:

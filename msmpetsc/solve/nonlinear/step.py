@@ -260,7 +260,8 @@ class Stepper:
 
         Raises StepFailed, StepStopped and InputError.
         """
-        newton, may_soften = self.method, self.static and self.stiffest > 2 and not self.budget
+        newton = self.method
+        may_soften = self.static and self.stiffest > 2 and not self.budget
         if not (isinstance(newton, Newton) and may_soften):
             return newton.minimise(start, outcome)
         newton.ends_on_overshoot = True

@@ -64,6 +64,7 @@ def as_argument(value: Array | float | tuple[Any, ...]) -> tuple[Kind, Words]:
     return SCALARS[type(number)], (number,)  # type: ignore[return-value]  # no array
 
 
+# the size bounds the memory
 @lru_cache(maxsize=4096)
 def described(
     pointer: int, shape: tuple[int, ...], strides: tuple[int, ...], dtype: str

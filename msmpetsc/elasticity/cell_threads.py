@@ -115,9 +115,13 @@ def _write_states(
 
 @kernel
 def _write_changes(
-    first: int, count: int, step: int, parts: Floats, cells: CellRows, ends: tuple[Rows, Rows]
+    first: int, count: int, step: int, parts: Floats, cells: CellRows, path: tuple[Rows, Rows]
 ) -> None:
-    moved, base = ends
+    """Write E(base + moved) - E(base) [J] of each cell to ``parts`` (count,).
+
+    path : ``moved`` and ``base``, (l, 3) [m]
+    """
+    moved, base = path
     for i in range(first, count, step):
         k, d, e = constants_at(cells, i), strains_at(moved, cells, i), strains_at(base, cells, i)
         g, f = gradient_of(d, 1.0 / cells.h4), gradient_of(e, 1.0 / cells.h4)

@@ -108,10 +108,14 @@ def crushing_energy(lattice: Lattice) -> float:
 
 @kernel
 def _elastic_change(
-    first: int, count: int, step: int, sums: Floats, springs: Springs, nodes: tuple[Rows, Rows]
+    first: int, count: int, step: int, sums: Floats, springs: Springs, path: tuple[Rows, Rows]
 ) -> None:
+    """Write E(base + moved) - E(base) [J] to ``sums``.
+
+    path : ``moved`` and ``base``, (l, 3) [m]
+    """
     ends, rest_length, stiffness = springs
-    moved, base = nodes
+    moved, base = path
     change = 0.0
     for s in range(first, count, step):
         before = vector(base, ends[s, 1], ends[s, 0])

@@ -110,7 +110,7 @@ def corner_blend(v: int, u: Floats) -> float:
     """Return W(v, p) of Eq. 8: the product over the axes of smoothstep(1 - distance to v).
 
     The 8 values sum to 1. On a face of the cell only its 4 corners have a weight, and the normal
-    derivative of each W is 0.
+    derivative of each W is 0. So cells with the same L_v at these corners share value and slope.
     """
     product = 1.0
     for axis in range(3):

@@ -309,6 +309,7 @@ def _slab_cells(body: BodySurface, grid: Grid) -> SlabCells:
         columns = Columns.crossed(outwards, *limits)
         if body.comm.allreduce(columns.leak, MPI.MAX) < LEAK:
             gaps = gaps_between(touched)
+            # winding numbers are 1 inside and 0 outside
             is_inside_body = columns.inside(gaps[:, [0, 1, 3]])[0][:, 0, 0, 0] > 0.5
             return SlabCells(touched, gaps[is_inside_body], columns)
     return SlabCells(touched, _gaps_by_winding(body, grid, axes, edges, touched), None)

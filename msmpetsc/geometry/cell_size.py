@@ -38,6 +38,7 @@ def choose_cell_size(
         slabs = slabs_of_all(bodies, grids, 20 * max_cells)
         excess[guess] = np.log(sum(cells.count(comm) for cells in slabs) / count)
         nearest = min(excess, key=lambda size: abs(excess[size]))
+        # a hundredth of the cells changes results by far less than the lattice's error
         if abs(np.expm1(excess[nearest])) <= 0.01:
             return float(np.exp(nearest))
         guess = _next_guess(excess, nearest)

@@ -12,7 +12,7 @@ from msmpetsc.scene.values import IntegratorName, Positive, Table, only_for
 MAX_STEPS = 10**9
 STATIC: Final = "static"
 IMPLICIT = ("implicit-euler", "bdf2")
-# tables whose keys TIME_KEYS say that they vary over time
+# tables that act on bodies, and keys of these tables that vary over time
 LOADS = ("anchor", "force", "traction", "pressure", "obstacle", "body")
 TIME_KEYS = ("path", "times", "start", "stop")
 

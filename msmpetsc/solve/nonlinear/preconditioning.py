@@ -223,12 +223,13 @@ class LatticePreconditioner(StepPreconditioner):
         return changed
 
     def most_iterations(self, rtol: float) -> int | None:
+        # a hierarchy of the present positions, or before its first solve, has no limit
         if self.is_new or self.rate is None:
             return None
         return int(self.rate * _digits(rtol) + PATIENCE - self.excess)
 
     def learn(self, its: int, rtol: float) -> None:
-        """Count the iterations of a linear solve.
+        """Count the iterations of a linear solve to a relative tolerance.
 
         A hierarchy is kept until its excess iterations have cost as much as a new hierarchy. So the
         total cost is at most twice the least possible cost.

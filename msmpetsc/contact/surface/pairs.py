@@ -271,19 +271,19 @@ class ContactSearch:
 
     def nearest(self, q: Positions) -> str:
         """Return a text that names the two nearest parts of the surface at q, and their place."""
-        moment = self.find(q)
-        words = ""
-        if self.barrier:
-            points = self.barrier.nearest(moment.contacts, moment.points)
-            names = dict.fromkeys(self.name_of(point) for point in points)
-            place = ", ".join(f"{x:.4g}" for x in moment.points[points].mean(axis=0))
-            words = (
-                f"{' and '.join(names)} meet at ({place}) m"
-                if len(points)
-                else "parts of the surface meet"
-            )
-        in_words: str = self.comm.bcast(words)
+        in_words: str = self.comm.bcast(self.in_words(self.find(q)))
         return in_words
+
+    def in_words(self, moment: SurfaceContactsAt) -> str:
+        """Return a text that names the two nearest parts in contact, on rank 0; "" elsewhere."""
+        if not self.barrier:
+            return ""
+        points = self.barrier.nearest(moment.contacts, moment.points)
+        if not len(points):
+            return "parts of the surface meet"
+        names = dict.fromkeys(self.name_of(point) for point in points)
+        place = ", ".join(f"{x:.4g}" for x in moment.points[points].mean(axis=0))
+        return f"{' and '.join(names)} meet at ({place}) m"
 
     def collision_free_step(
         self, q: Positions, end: Positions, begin: float | None = None

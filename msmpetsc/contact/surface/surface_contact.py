@@ -13,9 +13,10 @@ from mpi4py import MPI
 from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
-from msmpetsc.comm import reduced
+from msmpetsc.comm import reduced, together
 from msmpetsc.contact.surface.pairs import ContactSearch, SurfaceContactsAt
 from msmpetsc.contact.surface.surface_friction import SurfaceFriction
+from msmpetsc.errors import StepFailed
 
 # Displacement below which a change of energy is the mean force times the displacement
 # [dhat]; a difference of energies would lose its digits
@@ -363,11 +364,25 @@ class SurfaceContact:
     def _whole_hessian(
         self, moment: SurfaceContactsAt, projected: bool, duals: Rows | None
     ) -> csr_array | None:
-        """Return the Hessian (3 total, 3 total) [N/m] of all points on rank 0, else None."""
-        barrier = self.contacts.barrier
+        """Return the Hessian (3 total, 3 total) [N/m] of all points on rank 0, else None.
+
+        Raises StepFailed if the Hessian is not finite.
+        """
+        barrier, parts = self.contacts.barrier, []
+        with together(self.comm):
+            if barrier:
+                try:
+                    parts = barrier.hessian(moment.contacts, moment.points, projected)
+                # ipctk cannot project a pair's Hessian that is not finite
+                except RuntimeError as error:
+                    meet = self.contacts.in_words(moment)
+                    raise StepFailed(
+                        f"has contact forces that are not finite: {meet}; "
+                        "try a smaller time.step, or paths that leave the body more room",
+                        "contact",
+                    ) from error
         if barrier is None:
             return None
-        parts = barrier.hessian(moment.contacts, moment.points, projected)
         if self.friction:
             parts.append(self.friction.hessian(moment.points, duals))
         return csr_array(sum(parts)) if parts else csr_array((moment.points.size,) * 2)

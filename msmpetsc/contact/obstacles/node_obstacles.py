@@ -97,7 +97,7 @@ class NodeObstacles:
         ended = None if end is None else end[:owned]
         states = before.states if before else []
         return [
-            p.during(q[:owned], *step, side[:owned], last, ended, states)
+            p.during(q[:owned], *step, side[:owned], last=last, end=ended, before=states)
             for p, side in self._pressing(step[0], sides)
         ]
 

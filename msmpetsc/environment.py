@@ -13,7 +13,7 @@ from msmpetsc.constraints.anchors import Anchor, Anchors
 from msmpetsc.constraints.forces import ActingForces
 from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.obstacles.node_obstacles import NodeObstacles
-from msmpetsc.contact.step_contact import StepContact
+from msmpetsc.contact.step_contact import StepContact, StepContactAt
 from msmpetsc.contact.surface.pairs import ContactSearch, ContactSummary
 from msmpetsc.contact.surface.surface_contact import SurfaceContact
 from msmpetsc.elasticity.energy import Elasticity
@@ -46,8 +46,8 @@ class Environment:
         self.obstacles = NodeObstacles(model.lattice, model.penalties, model.exchanges)
         self.moving: list[Anchor | Obstacle] = [*model.anchors, *model.obstacles]
         self.contacts = ContactSearch(model.collision) if model.collision else None
-        # end positions and contact of the last step; None without contact
-        self._ended: tuple[Positions, StepContact] | None = None
+        # Contact at the end of the last step; None without contact
+        self._ended: StepContactAt | None = None
         self.touches = bool(model.penalties or self.contacts)
         self.system_monitor: Callable[[Any, Any], None] | None = None
 
@@ -79,21 +79,23 @@ class Environment:
         time: float,
         time_step: float,
         sides: Indices | None,
-        end: Positions | None = None,
+        end: StepContactAt | None = None,
     ) -> StepContact | None:
         """Return the contact of a step from q, with friction; None without contact (collective).
 
         last : positions (l, 3) [m] one step before q, for a two-step method
-        end  : positions (l, 3) [m] at which an earlier solve of this step ended, whose normal
-            forces then limit friction
+        end  : contact at the end of an earlier solve of this step, whose normal forces then limit
+            friction
         """
         previous = self._previous_contact(q)
         surface = None
-        states = self.obstacles.during(q, last, end, (time, time_step), sides, previous)
+        ended = end.q if end else None
+        states = self.obstacles.during(q, last, ended, (time, time_step), sides, previous)
         if self.contacts and not self.contacts.is_left_out:
-            surface = SurfaceContact(
-                self.contacts, q, time_step, last, end, previous.surface if previous else None
-            )
+            start = self.contacts.of_step(q, max(time - time_step, 0.0))
+            pairs = end.surface.pairs if end and end.surface else None
+            before = previous.surface if previous else None
+            surface = SurfaceContact(self.contacts, start, time_step, last, pairs, before)
         return StepContact(states, self.lattice.owned, surface) if states or surface else None
 
     def begin_contacts(self, q: Positions, time: float, time_step: float) -> None:
@@ -102,29 +104,32 @@ class Environment:
         If contacts are few, only pairs near them are candidates (collective).
         """
         if self.contacts:
-            begin = max(time - time_step, 0.0)
-            self.contacts.begin_step(begin, time)
-            self.contacts.narrow(q, begin)
+            self.contacts.narrow(self.contacts.begin_step(q, max(time - time_step, 0.0), time))
 
     def _previous_contact(self, q: Positions) -> StepContact | None:
         """Return the contact of the last step if it ended at q, otherwise None (collective)."""
-        if self._ended is None:
+        ended = self._ended
+        if ended is None or not reduced(self.lattice.table.comm, q is ended.q, MPI.LAND):
             return None
-        ended, contact = self._ended
-        return contact if reduced(self.lattice.table.comm, q is ended, MPI.LAND) else None
+        return ended.contact
 
-    def end_step(self, x: Positions, contact: StepContact | None) -> None:
-        """Record that a step ended at x (l, 3) [m], from which friction continues."""
-        self._ended = (x, contact) if contact else None
+    def end_step(self, contact: StepContactAt | None) -> None:
+        """Record the contact at the end of a step, from which friction continues."""
+        self._ended = contact
+        if self.contacts and contact and contact.surface:
+            self.contacts.end = contact.surface.pairs
 
-    def friction_lags(self, x: Positions, contact: StepContact | None) -> bool:
-        """Return whether friction in a step to x (l, 3) [m] used an outdated limit (collective).
+    def friction_lags(self, contact: StepContactAt | None) -> bool:
+        """Return whether friction in a step used an outdated limit (collective).
 
-        The limit is outdated if it differs from mu N at x by more than a factor of LAG_LIMIT.
+        The limit is outdated if it differs from mu N at the step's end by more than a factor of
+        LAG_LIMIT.
+
+        contact : contact at the end of the step
         """
         if not contact:
             return False
-        used, at_end = reduced(self.lattice.table.comm, contact.friction_limits(x))
+        used, at_end = reduced(self.lattice.table.comm, contact.friction_limits())
         return bool(max(at_end, used) > LAG_LIMIT * min(at_end, used))
 
     def forget(self) -> None:
@@ -138,4 +143,6 @@ class Environment:
 
         time : [s]
         """
-        return self.contacts.touch(q, time) if self.contacts else ContactSummary()
+        if not self.contacts:
+            return ContactSummary()
+        return self.contacts.summary(self.contacts.of_step(q, time))

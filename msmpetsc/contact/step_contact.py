@@ -13,7 +13,7 @@ from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows, like
 from msmpetsc.contact.friction import squares
 from msmpetsc.contact.obstacles.node_friction import Movers, Pressed, apply_friction
 from msmpetsc.contact.obstacles.penalty import ObstacleContact
-from msmpetsc.contact.surface.surface_contact import SurfaceContact
+from msmpetsc.contact.surface.surface_contact import SurfaceContact, SurfaceContactAt
 
 # depth of a stopped node over its depth without the stop [-]; above 0, so that the
 # Hessian includes the contact
@@ -47,36 +47,14 @@ class StepContact:
             energy += 0.5 * state.penalty.stiffness * float(inside @ inside)
         return energy
 
-    def change(self, q: Positions, base: Positions) -> float:
-        """Return the change [J] of the contact energy from base to q, friction included."""
-        total = 0.0
-        for state in self.states:
-            total += state.change(q[: self.owned], base[: self.owned])
-            if state.friction:
-                total += state.friction.change(q, base)
-        return total + (self.surface.change(q, base) if self.surface else 0.0)
-
     def change_of_friction(self, q: Positions, base: Positions) -> float:
         """Return the change [J] of the obstacles' friction energy from base to q."""
         return sum(state.friction.change(q, base) for state in self.states if state.friction)
 
     def at(self, q: Positions) -> "StepContactAt":
         """Return the contact at q."""
-        return StepContactAt(self, q, [state.pressed(q[: self.owned]) for state in self.states])
-
-    def friction_limits(self, q: Positions) -> Floats:
-        """Return this rank's sums of mu N [N], (2,): as the step's friction uses it, and at q."""
-        of_nodes = sum(
-            (state.friction_limits(q[: self.owned]) for state in self.states), np.zeros(2)
-        )
-        return of_nodes + self.surface.friction_limits(q) if self.surface else of_nodes
-
-    def released(self, q: Positions) -> float:
-        """Return the energy [J] of elastic slips at the step's beginning minus that at q."""
-        of_nodes = sum(
-            state.friction.released(q[: self.owned]) for state in self.states if state.friction
-        )
-        return of_nodes + (self.surface.released(q) if self.surface else 0.0)
+        pressed = [state.pressed(q[: self.owned]) for state in self.states]
+        return StepContactAt(self, q, pressed, self.surface.at(q) if self.surface else None)
 
     def no_duals(self) -> Duals:
         """Return the duals for which ``hessian`` has the secant of the obstacles' friction.
@@ -89,14 +67,6 @@ class StepContact:
             None,
         ]
 
-    def duals_after(self, q: Positions, base: Positions, duals: Duals) -> Duals:
-        """Return the duals of friction after the full step from base to q."""
-        of_nodes = [
-            state.friction.duals_after(q, base, known) if state.friction else None
-            for state, known in zip(self.states, duals[:-1], strict=True)
-        ]
-        return [*of_nodes, self.surface.duals_after(q, base, duals[-1]) if self.surface else None]
-
 
 @dataclass(frozen=True)
 class StepContactAt:
@@ -104,16 +74,13 @@ class StepContactAt:
 
     q       : (owned or more, 3) positions [m]
     pressed : the nodes inside each obstacle
+    surface : contact of surfaces; None without it
     """
 
     contact: StepContact
     q: Positions
     pressed: list[Pressed]
-
-    @property
-    def surface(self) -> SurfaceContact | None:
-        """Contact of surfaces; None without it."""
-        return self.contact.surface
+    surface: SurfaceContactAt | None
 
     @property
     def of_obstacles(self) -> Iterator[tuple[ObstacleContact, Pressed]]:
@@ -128,12 +95,49 @@ class StepContactAt:
             for state, (rows, _, _) in self.of_obstacles
         )
 
+    def change(self, base: "StepContactAt") -> float:
+        """Return the change [J] of the contact energy from base to here, friction included."""
+        owned, total = self.contact.owned, 0.0
+        for state in self.contact.states:
+            total += state.change(self.q[:owned], base.q[:owned])
+            if state.friction:
+                total += state.friction.change(self.q, base.q)
+        if self.surface and base.surface:
+            total += self.surface.change(base.surface)
+        return total
+
+    def friction_limits(self) -> Floats:
+        """Return this rank's sums of mu N [N], (2,): as the step's friction uses it, and here."""
+        owned = self.contact.owned
+        of_nodes = sum(
+            (state.friction_limits(self.q[:owned]) for state in self.contact.states), np.zeros(2)
+        )
+        return of_nodes + self.surface.friction_limits() if self.surface else of_nodes
+
+    def released(self) -> float:
+        """Return the energy [J] of elastic slips at the step's beginning minus that here."""
+        of_nodes = sum(
+            state.friction.released(self.q) for state in self.contact.states if state.friction
+        )
+        return of_nodes + (self.surface.released() if self.surface else 0.0)
+
+    def duals_after(self, base: "StepContactAt", duals: Duals) -> Duals:
+        """Return the duals of friction after the full step from base to here."""
+        of_nodes = [
+            state.friction.duals_after(self.q, base.q, known) if state.friction else None
+            for state, known in zip(self.contact.states, duals[:-1], strict=True)
+        ]
+        of_surface = None
+        if self.surface and base.surface:
+            of_surface = self.surface.duals_after(base.surface, duals[-1])
+        return [*of_nodes, of_surface]
+
     def add_gradient(self, gradient: Rows) -> None:
         """Add the gradient [N] of the contact energy to ``gradient`` (owned or more, 3)."""
         for state, pressed in self.of_obstacles:
             state.add_gradient(self.q[: self.contact.owned], pressed, gradient)
         if self.surface:
-            self.surface.add_gradient(self.q, gradient)
+            self.surface.add_gradient(gradient)
 
     def stopped(self, end: Positions) -> Positions | None:
         """Return ``end`` with the nodes that enter obstacles on the path stopped; None if none do.
@@ -178,7 +182,7 @@ class StepContactAt:
             bound[rows] += state.penalty.stiffness
             if state.friction:
                 bound[state.friction.nodes] += 2 * state.friction.limit / state.friction.stick
-        return bound + self.surface.bound(self.q) if self.surface else bound
+        return bound + self.surface.bound() if self.surface else bound
 
     def power(self, begin: float, end: float) -> float:
         """Return the power [W] that moving obstacles' penalties put into this rank's nodes.

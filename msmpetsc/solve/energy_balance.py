@@ -159,9 +159,8 @@ class EnergyBalance:
         pressing, dragged = self.environment.obstacles.pressing_displacement(
             (before.q[owned], before.sides), (result.position[owned], after.sides), time, time_step
         )
-        contact = result.problem and result.problem.contact
-        if contact and contact.surface:
-            pushed, carried = contact.surface.pressing_displacement(before.q, result.position)
+        if result.contact and result.contact.surface:
+            pushed, carried = result.contact.surface.pressing_displacement()
             pressing, dragged = pressing + pushed, dragged + carried
         is_fixed = self.environment.anchors.fixed_at(time)[owned].any(axis=0)
         sums = self._sums(
@@ -279,7 +278,7 @@ class EnergyBalance:
         ended = result.position[owned], after.sides
         along = time_step * np.broadcast_to(frame, 3)
         shift, drift = like(lattice.nodes, along), like(lattice.nodes, along / time_step)
-        pressing = result.problem and result.problem.contact
+        pressing = result.contact
         surface = pressing and pressing.surface
         work = 0.0
         # Explicit steps count the work of loads in StepResult.
@@ -296,8 +295,8 @@ class EnergyBalance:
                 (q[owned], sides), ended, time, time_step, along
             )
             + result.viscous_work
-            + (surface.of_obstacles(result.position, along)[1] / self.comm.size if surface else 0.0)
-            + (pressing.released(result.position) if pressing else 0.0),
+            + (surface.of_obstacles(along)[1] / self.comm.size if surface else 0.0)
+            + (pressing.released() if pressing else 0.0),
             result.work,
             result.swing,
         )

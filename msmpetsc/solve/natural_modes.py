@@ -69,9 +69,11 @@ def modes_of(comm: MPI.Intracomm, scene: Scene, model: Model, count: int) -> Mod
         with TimeLoop(comm, scene, model) as loop:
             for _ in loop.advance():
                 pass
-            assert isinstance(loop.integrator, Static) and loop.integrator.problem
+            assert isinstance(loop.integrator, Static) and loop.integrator.last
+            problem = loop.integrator.last.problem
+            assert problem is not None
             time = scene.time.steps * scene.time.step
-            return _about(loop.environment, loop.state.q, loop.integrator.problem, time, count)
+            return _about(loop.environment, loop.state.q, problem, time, count)
     is_given = any(start and start.from_ for start in scene.starts)
     q = model.start[0] if is_given else model.lattice.nodes
     environment = Environment(model)
@@ -102,7 +104,7 @@ def _about(
             )
         stepper.set_up()
         functional.begin(replace(problem, q=q, y=q))
-        contact = functional.contact_at(q)
+        contact = functional.place(q).contact
         with petsc_errors("PETSc cannot find modes", stepper):
             stepper.jacobian.hessian.linearise(q, contact)
             stepper.jacobian.preconditioner.prepare(q, contact)

@@ -380,9 +380,10 @@ class Forces:
         step  : result of the last step; None at the start
         """
         environment, owned = self.environment, self.model.lattice.owned
-        problem = step.problem if step else None
-        acting = problem.contact if problem else environment.obstacles.push(time, sides)
-        contact = acting.at(q) if acting else None
+        contact = step.contact if step else None
+        if contact is None:
+            acting = environment.obstacles.push(time, sides)
+            contact = acting.at(q) if acting else None
         loads = environment.forces.at(time)
         load = loads.at(q)
         sums = {"load": to_host(load.sum(axis=0)), **self._pushes(q, contact)}
@@ -436,9 +437,9 @@ class Forces:
         bodies = len(lattice.first_of_body)
         touching = np.zeros((bodies, 3))
         if contact and contact.surface:
-            obstacles, _ = contact.surface.of_obstacles(q)
+            obstacles, _ = contact.surface.of_obstacles()
             push[contact.surface.contacts.obstacles.numbers] += obstacles / self.comm.size
             own = np.zeros_like(q[:owned])
-            contact.surface.add_gradient(q, own)
+            contact.surface.add_gradient(own)
             touching -= sums_by(lattice.body[:owned, None], own, bodies)
         return {"push": push, "contact_push": touching}

@@ -216,7 +216,7 @@ def test_the_surface_is_asked_about_around_what_touches_alone(
 
 def begun_with_all(self: Environment, q: np.ndarray, time: float, time_step: float) -> None:
     assert self.contacts is not None
-    self.contacts.begin_step(max(time - time_step, 0.0), time)
+    self.contacts.begin_step(q, max(time - time_step, 0.0), time)
 
 
 def test_what_stores_too_little_to_count_may_be_left_out(folder: Path, monkeypatch):
@@ -226,14 +226,15 @@ def test_what_stores_too_little_to_count_may_be_left_out(folder: Path, monkeypat
     assert model.collision is not None
     contacts, start = ContactSearch(model.collision), model.lattice.nodes
     end = start - np.where(model.lattice.body[:, None] == 1, [0, 0, 0.002 - 0.5 * DISTANCE], 0.0)
-    energy = contacts.touch(end, 0.01).energy
+    begun = contacts.begin_step(start, 0.0, 0.01)
+    energy = contacts.summary(contacts.find(end)).energy
     for left_out, is_right in ((1.01, True), (0.99, False)):
-        contacts.narrow(start, 0.0)
+        contacts.narrow(begun)
         assert contacts.is_left_out
-        assert contacts.check_narrow_step(start, end, left_out * energy) == (True, is_right)
+        assert contacts.check_narrow_step(None, end, left_out * energy) == (True, is_right)
         assert contacts.is_narrow != is_right and not contacts.is_left_out
-    assert contacts.touch(end, 0.01).energy == pytest.approx(energy)
-    assert contacts.check_narrow_step(start, end, 0.0) == (True, True)
+    assert contacts.summary(contacts.end).energy == pytest.approx(energy)
+    assert contacts.check_narrow_step(contacts.end, end, 0.0) == (True, True)
 
 
 def test_a_step_past_what_it_would_meet_is_solved_with_the_surface(
@@ -270,7 +271,7 @@ def test_a_correction_through_the_surface_says_little_of_the_error(folder: Path)
         now = functional.at(q)
         stepper.control.estimate(now)
         correction = stepper.control.estimate.correction_norm
-        outcome = Outcome(corrected=True, compression=optimality.curvature.compression(q))
+        outcome = Outcome(corrected=True, compression=optimality.curvature.compression(now))
         verdict = optimality.examine(now, outcome, correction)
     assert verdict.error > 10 * correction / functional.distance(q)
 

@@ -111,7 +111,7 @@ def test_a_plate_turns_as_its_path_says_and_pushes_a_block_aside(
     def noting(self: LatticePreconditioner, q: np.ndarray, contact: StepContactAt | None) -> bool:
         changed = prepare(self, q, contact)
         if contact:
-            free_but_pressed.append(self.is_free and contact.surface.presses(q))
+            free_but_pressed.append(self.is_free and contact.surface.presses)
         return changed
 
     monkeypatch.setattr(LatticePreconditioner, "prepare", noting)
@@ -204,15 +204,15 @@ def test_a_block_that_turns_with_a_table_slips_by_nothing_in_a_step_of_bdf2(tmp_
         return Rotation.from_rotvec([0, 0, 2 * np.pi * time]).apply(model.lattice.nodes)
 
     contacts = ContactSearch(model.collision)
-    contacts.begin_step(t, 2 * t)
-    contact = SurfaceContact(contacts, turned(t), t, turned(0))
+    start = contacts.begin_step(turned(t), t, 2 * t)
+    contact = SurfaceContact(contacts, start, t, turned(0))
     friction = contact.friction
     assert friction is not None and len(friction.pairs) > 10
-    slip = friction.slip(contacts.points_at(turned(2 * t), 2 * t))[0]
+    slip = friction.slip(contacts.points(turned(2 * t), 2 * t))[0]
     np.testing.assert_allclose(slip, 0, atol=1e-14)
     # Friction of blocks that slip outwards is across the velocity of the table.
     slipped = turned(2 * t) * [1 + 1e-4, 1 + 1e-4, 1]
-    (force,), work = contact.of_obstacles(slipped)
+    (force,), work = contact.at(slipped).of_obstacles()
     assert abs(work) < 2e-3 * np.linalg.norm(force[:2]) * 2 * np.pi * t
 
 

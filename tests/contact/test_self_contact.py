@@ -5,6 +5,7 @@ Also resumed runs, meshes that cut themselves, and refusals.
 
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import igl
 import numpy as np
@@ -42,13 +43,22 @@ def closed(model: Model) -> np.ndarray:
     return q
 
 
+def begun(contacts: ContactSearch, q: np.ndarray, *given: Any) -> SurfaceContact:
+    """Return the contact of a step from q; ``given`` as in SurfaceContact, from ``last`` on."""
+    return SurfaceContact(contacts, contacts.begin_step(q, 0.0, T), T, *given)
+
+
 def contact(model: Model, slid: float = 0.0) -> tuple[SurfaceContact, np.ndarray]:
     """Return the contact of a step in which the left arm slides by a length [m], and its end."""
     q = closed(model)
     assert model.collision is not None
     end = q.copy()
     end[q[:, 0] < 0, 1] += slid
-    return SurfaceContact(ContactSearch(model.collision), q, T), end
+    return begun(ContactSearch(model.collision), q), end
+
+
+def change(term: SurfaceContact, q: np.ndarray, base: np.ndarray) -> float:
+    return term.at(q).change(term.at(base))
 
 
 # without friction, below the kink of friction, and beyond it
@@ -56,14 +66,14 @@ def contact(model: Model, slid: float = 0.0) -> tuple[SurfaceContact, np.ndarray
 def test_gradient_is_that_of_the_energy(model, slid: float):
     term, q = contact(model, slid)
     gradient = np.zeros_like(q)
-    term.add_gradient(q, gradient)
+    term.at(q).add_gradient(gradient)
     direction = np.random.default_rng(0).normal(size=q.shape)
     # moves beyond the limit below which forces give the change of energy
     for step in (
         1e-6,
         1e-7,
     ):
-        difference = term.change(q + step * direction, q - step * direction) / (2 * step)
+        difference = change(term, q + step * direction, q - step * direction) / (2 * step)
         assert difference == pytest.approx(np.vdot(gradient, direction), rel=1e-3)
     assert np.abs(gradient).max() > 0
 
@@ -79,15 +89,15 @@ def test_a_small_change_of_the_energy_keeps_its_digits(model, slid: float):
     forward = np.zeros_like(q)
     # the left arm approaches the right arm
     forward[q[:, 0] < 0, 0] = 1.0
-    product, hessian, step = np.zeros_like(q), term.hessian(q, False), 1e-13
+    product, hessian, step = np.zeros_like(q), term.at(q).hessian(False), 1e-13
     assert hessian is not None
     hessian.add_product(forward, product)
     # the linear parts cancel
-    bend = term.change(q + step * forward, q) + term.change(q - step * forward, q)
+    bend = change(term, q + step * forward, q) + change(term, q - step * forward, q)
     assert bend / (step**2 * np.vdot(product, forward)) == pytest.approx(1, rel=1e-3)
     longest = np.abs(model.collision.points.moved(forward)).max()
     below, above = (
-        term.change(q + share * SMALL * 1e-3 / longest * forward, q) / share
+        change(term, q + share * SMALL * 1e-3 / longest * forward, q) / share
         for share in (0.999, 1.001)
     )
     # on both sides of the move at which the formula changes
@@ -97,15 +107,15 @@ def test_a_small_change_of_the_energy_keeps_its_digits(model, slid: float):
 @pytest.mark.parametrize("slid", [0.0, 1e-7])
 def test_hessian_is_that_of_the_gradient_but_for_negative_parts(model, slid: float):
     term, q = contact(model, slid)
-    hessian, step = term.hessian(q, False), 1e-8
+    hessian, step = term.at(q).hessian(False), 1e-8
     assert hessian is not None
     # the arms approach as a whole: no pair turns or slides, so nothing is left out
     direction = np.zeros_like(q)
     direction[q[:, 0] < 0, 0] = 1.0
     product, after, before = (np.zeros_like(q) for _ in range(3))
     hessian.add_product(direction, product)
-    term.add_gradient(q + step * direction, after)
-    term.add_gradient(q - step * direction, before)
+    term.at(q + step * direction).add_gradient(after)
+    term.at(q - step * direction).add_gradient(before)
     difference = (after - before) / (2 * step)
     assert np.linalg.norm(product - difference) < 0.02 * np.linalg.norm(difference)
     for seed in range(3):
@@ -119,8 +129,8 @@ def test_friction_of_a_step_of_bdf2_goes_by_the_push_and_the_velocity_that_it_en
     # the left arm moves towards the right arm and along it
     came = np.where(q[:, :1] < 0, [2e-5, 1e-4, 0.0], 0.0)
     contacts = ContactSearch(model.collision)
-    now, before = (SurfaceContact(contacts, at, T).friction for at in (q, q - came))
-    friction = SurfaceContact(contacts, q, T, q - came).friction
+    now, before = (begun(contacts, at).friction for at in (q, q - came))
+    friction = begun(contacts, q, q - came).friction
     expected = np.clip(2 * now.limit - now.values_of(before.pairs, before.limit), 0, 2 * now.limit)
     np.testing.assert_allclose(friction.limit, expected, atol=1e-6 * expected.max())
     assert 1.05 < friction.limit.sum() / now.limit.sum() < 2
@@ -134,10 +144,10 @@ def test_friction_of_a_step_of_bdf2_goes_by_the_push_and_the_velocity_that_it_en
 def test_friction_goes_on_from_the_slip_that_pairs_held(model):
     q = closed(model)
     contacts = ContactSearch(model.collision)
-    first = SurfaceContact(contacts, q, T)
+    first = begun(contacts, q)
     stick, end = first.friction.stick, q.copy()
     end[q[:, 0] < 0, 1] += 0.4 * stick
-    then = SurfaceContact(contacts, end, T, None, None, first).friction
+    then = begun(contacts, end, None, None, first).friction
     held = first.friction.values_of(then.pairs, then.begin)
     np.testing.assert_allclose(
         held, first.friction.along(model.collision.points.moved(end - q)), atol=1e-12 * stick
@@ -148,7 +158,7 @@ def test_friction_goes_on_from_the_slip_that_pairs_held(model):
 
 def test_blocks_are_those_of_the_hessian_and_the_bound_is_no_less(model):
     term, q = contact(model)
-    hessian = term.hessian(q, False)
+    hessian = term.at(q).hessian(False)
     assert hessian is not None
     node = int(np.abs(hessian.blocks).max(axis=1).argmax())
     columns = np.empty((3, 3))
@@ -160,7 +170,7 @@ def test_blocks_are_those_of_the_hessian_and_the_bound_is_no_less(model):
     np.testing.assert_allclose(
         hessian.blocks[node].reshape(3, 3), columns, rtol=1e-10, atol=1e-12 * columns.max()
     )
-    bound = term.bound(q)
+    bound = term.at(q).bound()
     assert bound[node] >= np.linalg.eigvalsh(columns)[-1]
     assert set(np.log2(bound[bound > 0]) % 2) == {0.0}
 

@@ -79,7 +79,9 @@ def test_beyond_the_far_face_a_penalty_pushes_back_with_the_whole_depth():
     np.testing.assert_allclose(push, -50 * depth[:, None] * [0, 0, 1], atol=1e-12)
     assert contact.energy(q) == pytest.approx(25 * (depth**2).sum())
     deeper = q - [0, 0, 0.01]
-    assert contact.change(deeper, q) == pytest.approx(contact.energy(deeper) - contact.energy(q))
+    assert contact.at(deeper).change(contact.at(q)) == pytest.approx(
+        contact.energy(deeper) - contact.energy(q)
+    )
     assert contact.at(q).bound().tolist() == [50, 50, 50, 0]
     ((nodes, blocks),) = contact.at(q).hessian()
     assert nodes.tolist() == [0, 1, 2] and (blocks == 50 * np.diag([0, 0, 1])).all()

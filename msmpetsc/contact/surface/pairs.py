@@ -20,8 +20,8 @@ from msmpetsc.contact.surface.creases import NEAREST
 from msmpetsc.contact.surface.points import SurfacePoints
 from msmpetsc.geometry.surface import Surface
 
-# Number of positions whose contacts and candidates are kept: the base of a line search
-# and its trials
+# Number of broad phases whose candidates are kept: of the base of a line search and of
+# its trials
 REMEMBERED = 3
 # Margin of candidate pairs: displacement of a point before a new broad phase [mean
 # edges]; a smaller margin does not give fewer pairs, 0.25 gives four times as many
@@ -95,32 +95,32 @@ class CandidatePairs:
 
 
 @dataclass(frozen=True)
-class SurfaceContactsAt:
-    """Contacts at positions and a time of obstacles.
+class ActivePairs:
+    """Pairs that push at given positions and a time of obstacles.
 
-    q        : (owned, 3) positions [m]
-    time     : time [s] of the obstacles' places
-    count    : number of contacts
-    points   : S (p, 3) [m], on rank 0
-    contacts : the pairs that push, on rank 0
+    q      : (owned or more, 3) positions [m]
+    time   : time [s] of the obstacles' places
+    count  : number of pairs
+    points : S (p, 3) [m], on rank 0; (0, 3) elsewhere
+    sets   : the pairs, on rank 0
     """
 
     q: Positions
     time: float
     count: int
     points: Positions
-    contacts: ContactSets
+    sets: ContactSets
 
 
 class ContactSearch:
-    """Contacts of the surface in a step from ``begin`` to ``time`` [s].
+    """Search for contacts of the surface in a step from ``begin`` to ``time`` [s].
 
     All methods are collective. Positions are (owned or more, 3) [m]. Obstacles have their places at
-    the end of the step unless another time is given. Candidate pairs, contacts and points of the
-    last positions outlive a step.
+    the end of the step unless another time is given. Candidate pairs outlive a step.
 
     barrier     : on rank 0
     edge        : mean length of the bodies' edges at rest [m]
+    start, end  : pairs at the start and at the end of the last step; ``end`` is None before its end
     is_narrow   : whether only candidates around known contacts are used
     is_left_out : whether the step is narrow without contacts, so that the surface is left out
     """
@@ -135,27 +135,35 @@ class ContactSearch:
         )
         self.edge: float = comm.bcast(self.barrier.edge if self.barrier else 0.0)
         self.begin = self.time = 0.0
+        self.start: ActivePairs | None = None
+        self.end: ActivePairs | None = None
         self.is_narrow = self.is_left_out = False
-        # Candidates of a narrow step, and whether they are around each point (p,), on
+        # Candidates of a narrow step, and the points (p,) around which they are, on
         # rank 0
         self._around: CandidateSets = ()
         self._touched: Mask | None = None
         # The newest first
         self._known: list[CandidatePairs] = []
-        self._moments: list[SurfaceContactsAt] = []
-        # q, time and points of the last positions
-        self._points: list[tuple[Positions, float, Positions]] = []
 
-    def begin_step(self, begin: float, time: float) -> None:
-        """Use all candidates in a step between two times [s]."""
+    def begin_step(self, q: Positions, begin: float, time: float) -> ActivePairs:
+        """Begin a step from q between two times [s], with all candidates. Return the pairs at q."""
         self.begin, self.time, self._touched = begin, time, None
-        if self.is_narrow:
-            self.widen()
+        self.widen()
+        self.start, self.end = self.of_step(q, begin), None
+        return self.start
+
+    def of_step(self, q: Positions, time: float) -> ActivePairs:
+        """Return the pairs at q and a time [s], known if the last step began or ended there."""
+        for known in (self.end, self.start):
+            is_known = known is not None and known.q is q and self.same(known.time, time)
+            if known and reduced(self.comm, is_known, MPI.LAND):
+                return known
+        return self.find(q, time)
 
     def forget(self) -> None:
         """Forget all positions, so that the next step does not depend on earlier steps."""
-        self.begin_step(0.0, 0.0)
-        self._known, self._moments, self._points = [], [], []
+        self.widen()
+        self._known, self.start, self.end = [], None, None
 
     def _valid_at(self, *places: Positions) -> CandidatePairs | None:
         """Return the newest candidates that are valid at all ``places``, or None.
@@ -179,94 +187,81 @@ class ContactSearch:
         self._known = [newest, *self._known[: REMEMBERED - 1]]
         return newest
 
-    def find(self, q: Positions, time: float | None = None) -> SurfaceContactsAt:
-        """Return the contacts at positions q.
+    def find(self, q: Positions, time: float | None = None) -> ActivePairs:
+        """Return the pairs that push at positions q.
 
         time : time [s] of obstacles; None for the end of the step
         """
-        q, time = q[: self.owned], self.time if time is None else time
-        for moment in self._moments:
-            if self._is_at(moment.q, moment.time, q, time):
-                return moment
-        points, sets = self.points_at(q, time), self._around
+        time = self.time if time is None else time
+        points, sets = self.points(q, time), self._around
         if not self.is_narrow:
             sets = (self._valid_at(points) or self._broad_phase(points)).sets
-        contacts = self.barrier.contacts(sets, points) if self.barrier else ()
-        count = self.comm.bcast(sum(map(len, contacts)))
-        self._moments = [
-            SurfaceContactsAt(q.copy(), time, count, points, contacts),
-            *self._moments[: REMEMBERED - 1],
-        ]
-        return self._moments[0]
+        active = self.barrier.contacts(sets, points) if self.barrier else ()
+        count: int = self.comm.bcast(sum(map(len, active)))
+        return ActivePairs(q, time, count, points, active)
 
-    def narrow(self, q: Positions, time: float) -> None:
-        """Use only candidates around the contacts at q and a time [s], and around earlier contacts.
+    def narrow(self, pairs: ActivePairs) -> None:
+        """Use only candidates around the points of given pairs, and around earlier points.
 
         If too many points touch, the step uses all candidates.
         """
-        moment, touched = self.find(q, time), None
-        if self.barrier and moment.count:
-            touched = self.barrier.gradient(moment.contacts, moment.points).any(axis=1)
+        touched = None
+        if self.barrier and pairs.count:
+            touched = self.pushes(pairs).any(axis=1)
             touched = touched if self._touched is None else touched | self._touched
         self.is_narrow = self.comm.bcast(touched is None or touched.mean() < FEW)
-        self._moments, self._touched, self.is_left_out = (
-            [moment],
-            touched,
-            self.is_narrow and moment.count == 0,
-        )
-        points = self.points_at(q, self.time) if self.is_narrow and not self.is_left_out else None
-        if self.barrier and points is not None and touched is not None:
-            self._around = self.barrier.around(touched, points, FARTHEST * self.edge)
+        self._touched, self.is_left_out = touched, self.is_narrow and pairs.count == 0
+        if self.is_narrow and not self.is_left_out:
+            points = self.points(pairs.q, self.time)
+            if self.barrier and touched is not None:
+                self._around = self.barrier.around(touched, points, FARTHEST * self.edge)
 
     def widen(self) -> None:
         """Use all candidates from now on."""
-        self.is_narrow, self.is_left_out, self._moments = False, False, []
+        self.is_narrow = self.is_left_out = False
 
-    def check_narrow_step(self, q: Positions, x: Positions, left_out: float) -> tuple[bool, bool]:
-        """Return whether the path of a narrow step from q to x is free, and whether x is right.
+    def check_narrow_step(
+        self, used: ActivePairs | None, x: Positions, left_out: float
+    ) -> tuple[bool, bool]:
+        """Return whether the path of a narrow step to x is free, and whether x is right.
 
         The solution x is right if the contact energy of all pairs is within ``left_out`` [J] of the
         energy of the pairs used. Afterwards the step uses all candidates. But if the path is free
         and x is not right, the step stays narrow, with the candidates around all contacts at x.
+
+        used : pairs of the step at x; None if the surface was left out
         """
-        known = ContactSummary() if self.is_left_out else self.touch(x, self.time)
+        assert self.start is not None
+        energy = self.summary(used).energy if used else 0.0
         self.widen()
-        free = self.collision_free_step(q, x, self.begin) == 1.0
-        of_all = self.touch(x, self.time)
-        is_right = (
-            free and abs(of_all.energy - known.energy) <= SAME_ENERGY * known.energy + left_out
-        )
+        free = self.collision_free_step(self.start.q, x, self.begin) == 1.0
+        self.end = self.find(x)
+        of_all = self.summary(self.end).energy
+        is_right = free and abs(of_all - energy) <= SAME_ENERGY * energy + left_out
         if free and not is_right:
-            self.narrow(x, self.time)
+            self.narrow(self.end)
         return free, is_right
-
-    def points_at(self, q: Positions, time: float) -> Positions:
-        """Return the points (p, 3) [m] at q and a time [s] on rank 0; (0, 3) elsewhere."""
-        q = q[: self.owned]
-        for known, at, points in self._points:
-            if self._is_at(known, at, q, time):
-                return points
-        self._points = [(q.copy(), time, self.points(q, time)), *self._points[: REMEMBERED - 1]]
-        return self._points[0][2]
-
-    def _is_at(self, known: Positions, at: float, q: Positions, time: float) -> bool:
-        """Return whether positions and obstacles' places equal known places on all ranks."""
-        return self.same(at, time) and reduced(self.comm, bool(np.array_equal(q, known)), MPI.LAND)
 
     def same(self, begin: float, end: float) -> bool:
         """Return whether obstacles have the same places at two times [s]."""
         return not self.obstacles.moves(begin, end)
 
-    def touch(self, q: Positions, time: float) -> ContactSummary:
-        """Return number, least distance and energy of the contacts at q and a time [s]."""
-        moment = self.find(q, time)
-        touch = ContactSummary()
-        if self.barrier and moment.count:
-            least = self.barrier.least(moment.contacts, moment.points)
-            touch = ContactSummary(
-                moment.count, least, self.barrier.energy(moment.contacts, moment.points)
+    def pushes(self, pairs: ActivePairs) -> Rows:
+        """Return the gradient (total, 3) [N] of the barrier on rank 0; (0, 3) elsewhere."""
+        barrier = self.barrier
+        return (
+            barrier.gradient(pairs.sets, pairs.points) if barrier else np.zeros_like(pairs.points)
+        )
+
+    def summary(self, pairs: ActivePairs) -> ContactSummary:
+        """Return number, least distance and energy of the pairs."""
+        summary = ContactSummary()
+        if self.barrier and pairs.count:
+            least = self.barrier.least(pairs.sets, pairs.points)
+            summary = ContactSummary(
+                pairs.count, least, self.barrier.energy(pairs.sets, pairs.points)
             )
-        of_all: ContactSummary = self.comm.bcast(touch)
+        of_all: ContactSummary = self.comm.bcast(summary)
         return of_all
 
     def nearest(self, q: Positions) -> str:
@@ -274,15 +269,15 @@ class ContactSearch:
         in_words: str = self.comm.bcast(self.in_words(self.find(q)))
         return in_words
 
-    def in_words(self, moment: SurfaceContactsAt) -> str:
+    def in_words(self, pairs: ActivePairs) -> str:
         """Return a text that names the two nearest parts in contact, on rank 0; "" elsewhere."""
         if not self.barrier:
             return ""
-        points = self.barrier.nearest(moment.contacts, moment.points)
+        points = self.barrier.nearest(pairs.sets, pairs.points)
         if not len(points):
             return "parts of the surface meet"
         names = dict.fromkeys(self.name_of(point) for point in points)
-        place = ", ".join(f"{x:.4g}" for x in moment.points[points].mean(axis=0))
+        place = ", ".join(f"{x:.4g}" for x in pairs.points[points].mean(axis=0))
         return f"{' and '.join(names)} meet at ({place}) m"
 
     def collision_free_step(
@@ -293,8 +288,8 @@ class ContactSearch:
         begin : time [s] from which obstacles move to their present places; None if they stay
         """
         begin = self.time if begin is None else begin
-        start = self.points_at(q, begin)
-        moved = self.points_at(end, self.time) - start
+        start = self.points(q, begin)
+        moved = self.points(end, self.time) - start
         sets: CandidateSets | None = self._around
         if not self.is_narrow:
             # Candidates must be valid at both ends of the path

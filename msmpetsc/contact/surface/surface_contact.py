@@ -14,7 +14,7 @@ from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows
 from msmpetsc.comm import reduced, together
-from msmpetsc.contact.surface.pairs import ContactSearch, SurfaceContactsAt
+from msmpetsc.contact.surface.pairs import ActivePairs, ContactSearch
 from msmpetsc.contact.surface.surface_friction import SurfaceFriction
 from msmpetsc.errors import StepFailed
 
@@ -87,14 +87,12 @@ class SurfaceHessian:
 
 
 class SurfaceContact:
-    """Contact of surfaces in one step.
+    """Contact of surfaces in one step. All methods are collective.
 
-    All methods are collective. Positions are (owned or more, 3) [m].
-
-    start        : positions at the start of the step
-    last         : positions one step before ``start``, for BDF2, whose slip is the end velocity
-                   times tau
-    end          : end positions of an earlier solve of the step, which give the normal forces of
+    start        : pairs at the start of the step
+    last         : positions (l, 3) [m] one step before the start of the step, for BDF2, whose slip
+                   is the end velocity times tau
+    end          : pairs at the end of an earlier solve of the step, which give the normal forces of
                    friction; None for the normal forces at the start
     before       : contact in the last step
     has_friction : whether there is friction
@@ -105,37 +103,33 @@ class SurfaceContact:
     def __init__(
         self,
         contacts: ContactSearch,
-        start: Positions,
+        start: ActivePairs,
         time_step: float,
         last: Positions | None = None,
-        end: Positions | None = None,
+        end: ActivePairs | None = None,
         before: "SurfaceContact | None" = None,
     ):
-        self.contacts, self.comm = contacts, contacts.comm
-        self.has_friction, self.has_history = False, last is not None
+        self.contacts, self.comm, self.start = contacts, contacts.comm, start
+        self.has_history = last is not None
+        pairs = end or start
+        self.has_friction = contacts.law.friction > 0 and pairs.count > 0
         self.friction: SurfaceFriction | None = None
-        # The last Hessians, projected or not
-        self._hessians: dict[bool, tuple[SurfaceContactsAt, Rows | None, SurfaceHessian]] = {}
-        if contacts.law.friction > 0:
-            moment = contacts.find(start, contacts.begin) if end is None else contacts.find(end)
-            self.has_friction = moment.count > 0
-            if self.has_friction:
-                points = contacts.points_at(start, contacts.begin)
-                came = None if last is None else contacts.points.moved(start - last[: len(start)])
-                friction = self._friction(moment, points, came, time_step, end is None)
-                self.friction = (
-                    friction.after(before.friction, points) if friction and before else friction
-                )
+        if self.has_friction:
+            came = None if last is None else contacts.points.moved(start.q - last)
+            friction = self._friction(pairs, start.points, came, time_step, end is None)
+            self.friction = (
+                friction.after(before.friction, start.points) if friction and before else friction
+            )
 
     def _friction(
         self,
-        moment: SurfaceContactsAt,
+        pairs: ActivePairs,
         points: Positions,
         came: Rows | None,
         time_step: float,
         extrapolates: bool,
     ) -> SurfaceFriction | None:
-        """Return friction with the normal forces of the contacts ``moment``, on rank 0.
+        """Return friction with the normal forces of the pairs, on rank 0.
 
         points       : (p, 3) points at the start of the step [m]
         came         : (p, 3) displacements in the last step [m], for BDF2; None otherwise
@@ -149,104 +143,119 @@ class SurfaceContact:
         if barrier is None:
             return None
         if came is None:
-            return barrier.friction(moment.contacts, moment.points, points, stick)
+            return barrier.friction(pairs.sets, pairs.points, points, stick)
         if contacts.obstacles.total:
             came[contacts.points.bodies :] = contacts.obstacles.displacements_before(
                 contacts.begin, contacts.time
             )
-        friction = barrier.friction(
-            moment.contacts, moment.points, points + came / 3, 2 / 3 * stick
-        )
+        friction = barrier.friction(pairs.sets, pairs.points, points + came / 3, 2 / 3 * stick)
         if friction is None or not extrapolates:
             return friction
-        before = friction.values_of(*barrier.friction_limits(moment.contacts, points - came))
+        before = friction.values_of(*barrier.friction_limits(pairs.sets, points - came))
         return replace(friction, limit=np.clip(2 * friction.limit - before, 0, 2 * friction.limit))
 
-    def friction_limits(self, q: Positions) -> Floats:
-        """Return the sums of mu N [N], (2,), as friction uses it and at q; 0 on ranks above 0."""
-        if self.contacts.law.friction == 0:
-            return np.zeros(2)
-        moment, barrier = self.contacts.find(q), self.contacts.barrier
-        if not barrier:
-            return np.zeros(2)
-        by = self.friction.limit.sum() if self.friction else 0.0
-        return np.array([by, barrier.friction_limits(moment.contacts, moment.points)[1].sum()])
+    def at(self, q: Positions) -> "SurfaceContactAt":
+        """Return the contact at positions q (owned or more, 3) [m]."""
+        return SurfaceContactAt(self, self.contacts.find(q))
 
-    def presses(self, q: Positions) -> bool:
-        """Return whether contact acts at q."""
-        return self.contacts.find(q).count > 0 or self.has_friction
 
-    def change(self, q: Positions, base: Positions) -> float:
-        """Return this rank's part of the energy at q minus that at base, with friction [J].
+@dataclass(frozen=True)
+class SurfaceContactAt:
+    """Contact of surfaces at given positions in a step, with its derivatives.
+
+    All methods and properties are collective.
+
+    step  : contact in the step
+    pairs : pairs that push at the positions
+    """
+
+    step: SurfaceContact
+    pairs: ActivePairs
+
+    @property
+    def contacts(self) -> ContactSearch:
+        """Search of the contacts."""
+        return self.step.contacts
+
+    @property
+    def presses(self) -> bool:
+        """Whether contact acts."""
+        return self.pairs.count > 0 or self.step.has_friction
+
+    def friction_limits(self) -> Floats:
+        """Return the sums of mu N [N], (2,): as friction uses it, and here; 0 on ranks above 0."""
+        barrier, friction = self.contacts.barrier, self.step.friction
+        if self.contacts.law.friction == 0 or not barrier:
+            return np.zeros(2)
+        used = friction.limit.sum() if friction else 0.0
+        return np.array(
+            [used, barrier.friction_limits(self.pairs.sets, self.pairs.points)[1].sum()]
+        )
+
+    def change(self, base: "SurfaceContactAt") -> float:
+        """Return this rank's part of the energy here minus that at base, with friction [J].
 
         Over a small displacement the change is the displacement times the mean force, since a
         difference of energies would lose its digits.
         """
-        before, after = self.contacts.find(base), self.contacts.find(q)
-        is_small, of_friction = self._is_small(q, base), 0.0
-        moved = self.contacts.points.moved(q - base) if is_small else None
-        if self.friction:
-            of_friction = self.friction.change(after.points, before.points, moved)
+        before, after, friction = base.pairs, self.pairs, self.step.friction
+        is_small, of_friction = self._is_near(base), 0.0
+        moved = self.contacts.points.moved(after.q - before.q) if is_small else None
+        if friction:
+            of_friction = friction.change(after.points, before.points, moved)
         if moved is not None:
-            mean = 0.5 * (self._pushes(before) + self._pushes(after))
+            mean = 0.5 * (base._pushes() + self._pushes())
             return of_friction + float(np.vdot(mean, moved))
-        return of_friction + self._energy(after) - self._energy(before)
+        return of_friction + self._energy() - base._energy()
 
-    def _is_small(self, q: Positions, base: Positions) -> bool:
-        """Return whether points move too little from base to q for a difference of energies."""
-        points, time = self.contacts.points_at, self.contacts.time
-        gone = np.abs(points(q, time) - points(base, time)).max(initial=0.0)
-        return bool(self.comm.bcast(gone < SMALL * self.contacts.law.distance))
+    def _is_near(self, base: "SurfaceContactAt") -> bool:
+        """Return whether points move too little from base for a difference of energies."""
+        gone = np.abs(self.pairs.points - base.pairs.points).max(initial=0.0)
+        return bool(self.step.comm.bcast(gone < SMALL * self.contacts.law.distance))
 
-    def _energy(self, moment: SurfaceContactsAt) -> float:
+    def _energy(self) -> float:
         """Return the energy [J] of the barrier on rank 0, else 0."""
-        barrier = self.contacts.barrier
-        return barrier.energy(moment.contacts, moment.points) if barrier else 0.0
+        barrier, pairs = self.contacts.barrier, self.pairs
+        return barrier.energy(pairs.sets, pairs.points) if barrier else 0.0
 
-    def add_gradient(self, q: Positions, gradient: Rows) -> None:
-        """Add the gradient [N] at q to ``gradient`` (owned or more, 3)."""
-        self._add_to_nodes(self._gradient(self.contacts.find(q)), gradient)
+    def add_gradient(self, gradient: Rows) -> None:
+        """Add the gradient [N] to ``gradient`` (owned or more, 3)."""
+        self._add_to_nodes(self._gradient(), gradient)
 
     def _add_to_nodes(self, forces: Rows, gradient: Rows) -> None:
         """Add W^T f of forces (total, 3) [N] on rank 0 to ``gradient`` (owned or more, 3)."""
         points = self.contacts.points
         touched = np.flatnonzero(forces[: points.bodies].any(axis=1))
-        touched, forces = self.comm.bcast((touched, forces[touched]))
+        touched, forces = self.step.comm.bcast((touched, forces[touched]))
         weights = points.carried(touched)
         gradient[: weights.shape[1]] += weights.T @ forces
 
-    def add_change_of_gradient(self, q: Positions, displacements: Rows, gradient: Rows) -> None:
-        """Add the first-order change of the gradient [N] at q as obstacles move.
+    def add_change_of_gradient(self, displacements: Rows, gradient: Rows) -> None:
+        """Add the first-order change of the gradient [N] as obstacles move.
 
         The change is a product with the projected Hessian.
 
         displacements : (o, 3) of the obstacles' points [m]
         """
-        moment = self.contacts.find(q)
-        moved = np.zeros_like(moment.points)
+        moved = np.zeros_like(self.pairs.points)
         if len(moved):
             moved[self.contacts.points.bodies :] = displacements
-        whole = self._whole_hessian(moment, True, None)
+        whole = self._whole_hessian(True, None)
         self._add_to_nodes(
             moved if whole is None else (whole @ moved.ravel()).reshape(-1, 3), gradient
         )
 
-    def _gradient(self, moment: SurfaceContactsAt) -> Rows:
+    def _gradient(self) -> Rows:
         """Return the gradient (total, 3) [N] with friction on rank 0; (0, 3) elsewhere."""
-        of_friction = self.friction.gradient(moment.points) if self.friction else 0.0
-        return self._pushes(moment) + of_friction
+        friction = self.step.friction
+        return self._pushes() + (friction.gradient(self.pairs.points) if friction else 0.0)
 
-    def _pushes(self, moment: SurfaceContactsAt) -> Rows:
+    def _pushes(self) -> Rows:
         """Return the gradient (total, 3) [N] of the barrier on rank 0; (0, 3) elsewhere."""
-        barrier = self.contacts.barrier
-        return (
-            barrier.gradient(moment.contacts, moment.points)
-            if barrier
-            else np.zeros_like(moment.points)
-        )
+        return self.contacts.pushes(self.pairs)
 
-    def of_obstacles(self, q: Positions, frame: Floats | float = 0.0) -> tuple[Rows, float]:
-        """Return obstacles' forces (k, 3) [N] on the bodies, and their work [J] in the step to q.
+    def of_obstacles(self, frame: Floats | float = 0.0) -> tuple[Rows, float]:
+        """Return obstacles' forces (k, 3) [N] on the bodies, and their work [J] in the step.
 
         The work is of the force at the end of the step: an upper bound for a convex energy. In a
         step of BDF2 the obstacles have their velocity at its end, as in friction. If an obstacle
@@ -254,94 +263,97 @@ class SurfaceContact:
 
         frame : (3,) displacement of the frame [m] in which the work is counted
         """
-        moment = self.contacts.find(q)
         points, obstacles = self.contacts.points, self.contacts.obstacles
         step = self.contacts.begin, self.contacts.time
         forces_and_work = np.zeros((len(obstacles.numbers), 3)), 0.0
         if obstacles.total:
-            if len(moment.points):
-                forces = self._gradient(moment)[points.bodies :]
+            if len(self.pairs.points):
+                forces = self._gradient()[points.bodies :]
                 moved = obstacles.displacements(*step)
-                if self.has_history:
+                if self.step.has_history:
                     moved = 1.5 * moved - 0.5 * obstacles.displacements_before(*step)
                 work = float((forces * (moved - frame)).sum())
                 forces_and_work = obstacles.sums(forces), work
-            forces_and_work = self.comm.bcast(forces_and_work)
+            forces_and_work = self.step.comm.bcast(forces_and_work)
         return forces_and_work
 
-    def pressing_displacement(self, before: Positions, after: Positions) -> tuple[float, Floats]:
+    def pressing_displacement(self) -> tuple[float, Floats]:
         """Return the sum of forces [N], and the sum (3,) [N m] of force times displacement.
 
-        Both sums run over obstacles' points, at a step's start and at its end, without friction.
-        They are zero on ranks above 0.
+        Both sums run over obstacles' points, at the step's start and here, without friction. They
+        are zero on ranks above 0.
         """
         contacts, total, weighted = self.contacts, 0.0, np.zeros(3)
         if contacts.obstacles.total:
             moved = contacts.obstacles.displacements(contacts.begin, contacts.time)
-            for moment in (contacts.find(before, contacts.begin), contacts.find(after)):
-                if moment.count and len(moment.points):
-                    pushes = self._pushes(moment)[contacts.points.bodies :]
+            for pairs in (self.step.start, self.pairs):
+                if pairs.count and len(pairs.points):
+                    pushes = contacts.pushes(pairs)[contacts.points.bodies :]
                     forces = np.linalg.norm(pushes, axis=1)
                     total += float(forces.sum())
                     weighted += (forces[:, None] * moved).sum(axis=0)
         return total, weighted
 
-    def released(self, q: Positions) -> float:
-        """Return the energy [J] of elastic slips at the start minus that at q, on rank 0."""
-        moment = self.contacts.find(q)
-        return self.friction.released(moment.points) if self.friction else 0.0
+    def released(self) -> float:
+        """Return the energy [J] of elastic slips at the start minus that here, on rank 0."""
+        friction = self.step.friction
+        return friction.released(self.pairs.points) if friction else 0.0
 
-    def duals_after(self, q: Positions, base: Positions, duals: Rows | None) -> Rows | None:
-        """Return friction's duals (a, 3) after the full step from base to q.
+    def duals_after(self, base: "SurfaceContactAt", duals: Rows | None) -> Rows | None:
+        """Return friction's duals (a, 3) after the full step from base to here.
 
         duals : (a, 3) at base; None for the forces of the slips
         """
-        after, before = self.contacts.find(q), self.contacts.find(base)
-        if self.friction:
-            duals = self.friction.duals_after(after.points, before.points, duals)
-        of_root: Rows | None = self.comm.bcast(duals)
+        if self.step.friction:
+            points = self.pairs.points, base.pairs.points
+            duals = self.step.friction.duals_after(*points, duals)
+        of_root: Rows | None = self.step.comm.bcast(duals)
         return of_root
 
-    def hessian(
-        self, q: Positions, projected: bool, duals: Rows | None = None
-    ) -> SurfaceHessian | None:
-        """Return the Hessian at q; None if no contact acts.
+    @cached_property
+    def projected_hessian(self) -> SurfaceHessian | None:
+        """Projected Hessian with the true Hessian of friction; None if no contact acts."""
+        return self.hessian(True)
+
+    def hessian(self, projected: bool, duals: Rows | None = None) -> SurfaceHessian | None:
+        """Return the Hessian; None if no contact acts.
 
         projected : project the Hessian of each pair to be positive semidefinite
         duals     : (a, 3) duals of friction; None for the true Hessian of friction
         """
-        moment = self.contacts.find(q)
-        known = self._hessians.get(projected)
-        if not (moment.count or self.has_friction):
-            return None
-        if known is None or known[0] is not moment or known[1] is not duals:
-            touched, points = self.comm.bcast(self._curvature(moment, projected, duals))
-            known = (
-                moment,
-                duals,
-                SurfaceHessian(self.comm, self.contacts.points.carried(touched), points),
-            )
-            self._hessians[projected] = known
-        return known[2]
+        return self._on_nodes(self._whole_hessian(projected, duals)) if self.presses else None
 
-    def concavity(self, q: Positions) -> Floats:
+    def _on_nodes(self, whole: csr_array | None) -> SurfaceHessian:
+        """Return the Hessian of the points in contact, from all points' (3 total, 3 total) [N/m].
+
+        whole : on rank 0, None elsewhere
+        """
+        touched, points = None, None
+        if whole is not None:
+            rows = whole.indptr[: 3 * self.contacts.points.bodies + 1]
+            touched = np.flatnonzero(np.diff(rows).reshape(-1, 3).any(axis=1))
+            numbers = (3 * touched[:, None] + np.arange(3)).ravel()
+            points = csr_array(whole[numbers][:, numbers])
+        touched, points = self.step.comm.bcast((touched, points))
+        return SurfaceHessian(self.step.comm, self.contacts.points.carried(touched), points)
+
+    def concavity(self) -> Floats:
         """Return a diagonal (owned,) [N/m] that bounds the Hessian's negative part on nodes.
 
         The diagonal of row sums r bounds the negative part on points. The bound on nodes follows
         from (sum w v)^2 <= (sum |w|) (sum |w| v^2).
         """
-        touched, sums = self.comm.bcast(self._negative_part(self.contacts.find(q)))
-        bound: Floats = self.contacts.points.spread * (
-            np.abs(self.contacts.points.carried(touched)).T @ sums
-        )
+        points = self.contacts.points
+        touched, sums = self.step.comm.bcast(self._negative_part())
+        bound: Floats = points.spread * (np.abs(points.carried(touched)).T @ sums)
         return bound
 
-    def _negative_part(self, moment: SurfaceContactsAt) -> tuple[Indices, Floats] | None:
+    def _negative_part(self) -> tuple[Indices, Floats] | None:
         """Return points (k,) at which the Hessian has a negative part, and its row sums (k,) [N/m].
 
         On ranks above 0, return None.
         """
-        whole, kept = (self._whole_hessian(moment, projected, None) for projected in (False, True))
+        whole, kept = (self._whole_hessian(projected, None) for projected in (False, True))
         if whole is None or kept is None:
             return None
         own = 3 * self.contacts.points.bodies
@@ -349,33 +361,19 @@ class SurfaceContact:
         touched = np.flatnonzero(sums)
         return touched, sums[touched]
 
-    def _curvature(
-        self, moment: SurfaceContactsAt, projected: bool, duals: Rows | None
-    ) -> tuple[Indices, csr_array] | None:
-        """Return the points (k,) in contact and their Hessian (3k, 3k) [N/m], on rank 0."""
-        whole = self._whole_hessian(moment, projected, duals)
-        if whole is None:
-            return None
-        rows = whole.indptr[: 3 * self.contacts.points.bodies + 1]
-        touched = np.flatnonzero(np.diff(rows).reshape(-1, 3).any(axis=1))
-        numbers = (3 * touched[:, None] + np.arange(3)).ravel()
-        return touched, csr_array(whole[numbers][:, numbers])
-
-    def _whole_hessian(
-        self, moment: SurfaceContactsAt, projected: bool, duals: Rows | None
-    ) -> csr_array | None:
+    def _whole_hessian(self, projected: bool, duals: Rows | None) -> csr_array | None:
         """Return the Hessian (3 total, 3 total) [N/m] of all points on rank 0, else None.
 
         Raises StepFailed if the Hessian is not finite.
         """
-        barrier, parts = self.contacts.barrier, []
-        with together(self.comm):
+        barrier, pairs, parts = self.contacts.barrier, self.pairs, []
+        with together(self.step.comm):
             if barrier:
                 try:
-                    parts = barrier.hessian(moment.contacts, moment.points, projected)
+                    parts = barrier.hessian(pairs.sets, pairs.points, projected)
                 # ipctk cannot project a pair's Hessian that is not finite
                 except RuntimeError as error:
-                    meet = self.contacts.in_words(moment)
+                    meet = self.contacts.in_words(pairs)
                     raise StepFailed(
                         f"has contact forces that are not finite: {meet}; "
                         "try a smaller time.step, or paths that leave the body more room",
@@ -383,16 +381,16 @@ class SurfaceContact:
                     ) from error
         if barrier is None:
             return None
-        if self.friction:
-            parts.append(self.friction.hessian(moment.points, duals))
-        return csr_array(sum(parts)) if parts else csr_array((moment.points.size,) * 2)
+        if self.step.friction:
+            parts.append(self.step.friction.hessian(pairs.points, duals))
+        return csr_array(sum(parts)) if parts else csr_array((pairs.points.size,) * 2)
 
-    def bound(self, q: Positions) -> Floats:
+    def bound(self) -> Floats:
         """Return bounds (owned,) [N/m] of the diagonal blocks of the projected Hessian.
 
         The bounds are rounded up to powers of 4, so that they seldom change.
         """
-        hessian = self.hessian(q, True)
+        hessian = self.projected_hessian
         if hessian is None:
             return np.zeros(self.contacts.owned)
         norms = np.abs(hessian.blocks).reshape(-1, 3, 3).sum(axis=2).max(axis=1)

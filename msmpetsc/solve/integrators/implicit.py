@@ -21,7 +21,7 @@ from msmpetsc.backend.arrays import Indices, Mask, Positions, Rows
 from msmpetsc.checkpoint import Checkpoint, Range
 from msmpetsc.constraints.forces import ExternalForces
 from msmpetsc.contact.obstacles.reflection import StepTaken
-from msmpetsc.contact.step_contact import StepContact
+from msmpetsc.contact.step_contact import StepContactAt
 from msmpetsc.environment import Environment
 from msmpetsc.errors import StepFailed
 from msmpetsc.scene.schema import Solver
@@ -61,10 +61,10 @@ class ContactFaces:
     q_before   : (l, 3) [m] positions one step before q, for BDF2
     sides      : (o, l) faces of the next solve; in the end, the faces of the step
     is_settled : whether the last solve had the right contacts
-    contact    : contact of the last solve
+    contact    : contact at the end of the last solve, with all pairs of the surface
     start      : (l, 3) [m] solution from which the next solve may start
-    end        : (l, 3) [m] earlier solution, whose normal forces limit friction; None for the
-                 forces at q
+    end        : contact at the end of an earlier solve, whose normal forces limit friction; None
+                 for the forces at q
     """
 
     environment: Environment
@@ -80,9 +80,9 @@ class ContactFaces:
     def __post_init__(self) -> None:
         self.solves = 0
         self.is_settled = False
-        self.contact: StepContact | None = None
+        self.contact: StepContactAt | None = None
         self.start: Positions | None = None
-        self.end: Positions | None = None
+        self.end: StepContactAt | None = None
         self.sides = self._crossed(self.y)
         with CONTACT:
             self.environment.begin_contacts(self.q, self.time, self.time_step)
@@ -98,11 +98,11 @@ class ContactFaces:
         """Return the problem of the step with the present contact faces."""
         environment, time = self.environment, self.time
         before, step = self.q_before, self.time_step
-        self.contact = environment.contact(self.q, before, time, step, self.sides, self.end)
+        contact = environment.contact(self.q, before, time, step, self.sides, self.end)
         prescribed = environment.anchors.prescribed(self.q, time)
         load, pressures = self.load.force, self.load.pressures.values
         return StepProblem(
-            self.q, self.y, load, self.contact, prescribed,
+            self.q, self.y, load, contact, prescribed,
             pressures=pressures, system_monitor=environment.system_monitor,
         )  # fmt: skip
 
@@ -110,16 +110,15 @@ class ContactFaces:
         """Return the result of ``step`` with settled contacts. Raises StepFailed."""
         while not self.is_settled:
             result = step(self.problem())
-            self.compare(result.position, LEFT_OUT * result.energy_tolerance)
-        return result
+            self.compare(result)
+        return replace(result, contact=self.contact)
 
-    def compare(self, x: Positions, left_out: float) -> None:
-        """Update the contacts from the solution x (l, 3) [m] of the last solve.
+    def compare(self, result: StepResult) -> None:
+        """Update the contacts from the result of the last solve.
 
         Raises StepFailed if the faces do not settle in MOST_SOLVES solves.
-
-        left_out : energy of surface pairs at x that may be left out [J]
         """
+        x, self.contact = result.position, result.contact
         crossed, pressing = self._crossed(x), self.environment.obstacles.pressing
         sides = np.where(self.sides > 0, self.sides, crossed) if self.solves else crossed
         self.solves += 1
@@ -140,18 +139,24 @@ class ContactFaces:
             return
         narrow = contacts if contacts and contacts.is_narrow else None
         if narrow:
+            surface = result.contact.surface if result.contact else None
+            used = surface.pairs if surface else None
+            left_out = LEFT_OUT * result.energy_tolerance
             with CONTACT:
-                is_free, self.is_settled = narrow.check_narrow_step(self.q, x, left_out)
+                is_free, self.is_settled = narrow.check_narrow_step(used, x, left_out)
+            if result.contact and surface and narrow.end:
+                of_all = replace(surface, pairs=narrow.end)
+                self.contact = replace(result.contact, surface=of_all)
             if not self.is_settled:
                 self.start = x if is_free else None
                 if self.solves >= MOST_SOLVES:
                     narrow.widen()
                 return
-        if self.end is None and environment.friction_lags(x, self.contact):
-            self.end = self.start = x
+        if self.end is None and environment.friction_lags(self.contact):
+            self.end, self.start = self.contact, x
             self.is_settled = False
-            if narrow:
-                narrow.narrow(x, self.time)
+            if narrow and narrow.end:
+                narrow.narrow(narrow.end)
             return
         # Reflecting obstacles use the faces crossed on the path to x.
         if obstacles.penalties:
@@ -253,7 +258,7 @@ class ImplicitEuler(Integrator):
         result = faces.solve(
             lambda whole: self.stepper.step(replace(whole, rates=rates), faces.start)
         )
-        self.environment.end_step(result.position, faces.contact)
+        self.environment.end_step(result.contact)
         cost = replace(
             self.stepper.work_so_far() - work_before, steps=1, step_error=result.cost.step_error
         )

@@ -32,7 +32,7 @@ from msmpetsc.solve.integrators.integrator import State
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.free_bodies import bodies_of
 from msmpetsc.solve.nonlinear.curvature import NONE, Alarm
-from msmpetsc.solve.nonlinear.functional import StepProblem
+from msmpetsc.solve.nonlinear.functional import Place, StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 from msmpetsc.solve.petsc.library import petsc_errors
 from msmpetsc.solve.recovery import Halving
@@ -78,7 +78,6 @@ class LoadPath:
         self.displaced = first and not at_rest
         self.inverted = 0 if first else worst_inverted(self.stepper.comm, lattice, self.base)[0]
         self.holding: Rows | None = None
-        self.problem: StepProblem | None = None
 
     def try_share(self, steps: Halving) -> StepResult:
         """Return the equilibrium of the next share, ``steps.end``.
@@ -100,7 +99,7 @@ class LoadPath:
             raise StepFailed(
                 f"turned {count - self.inverted} cells inside out, the worst {where}", "inverted"
             )
-        self.reached, self.problem, self.sides = result.position, result.problem, faces.sides
+        self.reached, self.sides = result.position, faces.sides
         return result
 
     def _problem(self, whole: StepProblem, share: float) -> StepProblem:
@@ -128,14 +127,14 @@ class Static(ImplicitEuler):
 
     Forces, anchors and obstacles are taken at the end of the step.
 
-    error   : estimated relative error of the last equilibrium
-    problem : problem of the last equilibrium
+    error : estimated relative error of the last equilibrium
+    last  : result of the last step; None before it
     """
 
     STATIC = True
     state: ClassVar[dict[str, Range]] = {"error": ANY}
     error = 0.0
-    problem: StepProblem | None = None
+    last: StepResult | None = None
 
     def _first_tau(self) -> float:
         """Return SLENDER times the travel time [s] of sound along the longest side (collective)."""
@@ -150,7 +149,7 @@ class Static(ImplicitEuler):
         self.stepper.set_up()
         optimality, rest = self.stepper.optimality, self.stepper.lattice.nodes
         with petsc_errors("PETSc cannot set up the solver", self.stepper):
-            optimality.estimate.linearise(rest, None)
+            optimality.estimate.linearise(Place(rest, None))
             lowest, _ = optimality.curvature.lowest(rest, NONE, Alarm.NOWHERE, None)
         if lowest > 0 and not ACCEPTED_LOWEST[0] <= lowest <= ACCEPTED_LOWEST[1]:
             self.tau *= float(np.sqrt(LOWEST / lowest))
@@ -163,16 +162,19 @@ class Static(ImplicitEuler):
         before = time - self.time_step
         # If nothing that acts has changed, the last state is the equilibrium.
         if before > 0.5 * self.time_step and self.environment.is_same(before, time):
-            cost = Work(self.error, steps=1)
-            return StepResult(state.q, state.q, cost, static=True, problem=self.problem), state
+            last, cost = self.last, Work(self.error, steps=1)
+            if last is None or last.position is not state.q:
+                # The run was resumed, or another integrator has taken the last step.
+                last = StepResult(state.q, state.q, Work(), static=True)
+            return replace(last, cost=cost), state
         stepper = self.stepper
         work_before = stepper.work_so_far()
         path = LoadPath(stepper, self.environment, state, time, self.time_step)
         result, path = self._follow(path)
-        q, self.problem, self.error = result.position, path.problem, result.cost.step_error
+        q, self.error = result.position, result.cost.step_error
         cost = replace(stepper.work_so_far() - work_before, steps=1, step_error=self.error)
-        result = replace(result, previous=q, cost=cost, static=True, problem=self.problem)
-        return result, State(q, q, sides=path.sides)
+        self.last = replace(result, previous=q, cost=cost, static=True)
+        return self.last, State(q, q, sides=path.sides)
 
     def _follow(self, path: LoadPath) -> tuple[StepResult, LoadPath]:
         """Apply the whole load in as few load steps as possible; return the result and its path.

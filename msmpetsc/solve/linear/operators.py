@@ -141,8 +141,7 @@ class TrueHessian:
                 self.contact.linearise(contact, duals)
             self.surface = None
             if contact and contact.surface:
-                surface_duals = duals[-1] if duals else None
-                self.surface = contact.surface.hessian(q, projected, surface_duals)
+                self.surface = contact.surface.hessian(projected, duals[-1] if duals else None)
 
     def take_slopes(self, slopes: Array) -> None:
         """Replace V U' of a solid's cells at q by ``slopes`` (elasticity.solid.CellHessians)."""

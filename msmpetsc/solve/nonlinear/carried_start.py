@@ -135,14 +135,15 @@ class CarriedStart:
         functional, unknowns = self.functional, self.functional.unknowns
         x, change, f = (functional.vectors.take() for _ in range(3))
         contact = functional.problem.contact
-        assert contact is not None and contact.surface is not None
+        assert contact is not None
         if Stop.agreed(functional.comm):
             raise StepStopped("stopped by a signal")
         unknowns.from_nodes(q, x)
-        functional.evaluate(x, f)
-        self.jacobian.linearise(q, contact.at(q), True, contact.no_duals())
+        now = functional.evaluate(x, f, functional.place(q))
+        assert now.contact is not None and now.contact.surface is not None
+        self.jacobian.linearise(now, True, contact.no_duals())
         forces = self.jacobian.hessian.forces(fixed)
-        contact.surface.add_change_of_gradient(q, obstacles, forces)
+        now.contact.surface.add_change_of_gradient(obstacles, forces)
         unknowns.scaled_sum(np.zeros_like(q), functional.t2, forces, change)
         f.axpy(1.0, change)
         tolerances = self.ksp.getTolerances()

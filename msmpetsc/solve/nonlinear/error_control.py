@@ -159,7 +159,7 @@ class ErrorControl:
         """Return the outcome with the compression of its iterate."""
         if now.compression:
             return now
-        return replace(now, compression=self.curvature.compression(iterate.q))
+        return replace(now, compression=self.curvature.compression(iterate))
 
     def estimated(self, iterate: Iterate, now: Outcome, goal: float) -> Outcome:
         """Return the outcome with an estimated error.

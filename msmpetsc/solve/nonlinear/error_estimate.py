@@ -25,10 +25,8 @@ Then g can be examined at x - e_k (optimality.Optimality).
 import numpy as np
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Positions
-from msmpetsc.contact.step_contact import StepContactAt
 from msmpetsc.solve.linear.operators import TrueHessian, python_matrix
-from msmpetsc.solve.nonlinear.functional import Iterate, StepFunctional
+from msmpetsc.solve.nonlinear.functional import Iterate, Place, StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 from msmpetsc.solve.petsc.events import ESTIMATE
 
@@ -85,15 +83,15 @@ class ErrorEstimate:
         self.begin(acceptable)
         before = self.hessian.products + self.preconditioner.products
         with ESTIMATE:
-            self.linearise(iterate.q, iterate.contact)
+            self.linearise(iterate)
             self.ksp.solve(iterate.f, self.correction)
         self.products += self.hessian.products + self.preconditioner.products - before
         return self.correction_norm + self.missing if self.ksp.reason > 0 else np.inf
 
-    def linearise(self, q: Positions, contact: StepContactAt | None) -> None:
-        """Linearise the Hessian and the preconditioner at positions q (l, 3) [m]."""
-        self.preconditioner.prepare(q, contact)
-        self.hessian.linearise(q, contact)
+    def linearise(self, place: Place) -> None:
+        """Linearise the Hessian and the preconditioner at a place."""
+        self.preconditioner.prepare(place.q, place.contact)
+        self.hessian.linearise(place.q, place.contact)
         self.operator.assemble()
 
     def begin_step(self, has_contact: bool) -> None:

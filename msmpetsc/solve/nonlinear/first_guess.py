@@ -34,11 +34,11 @@ class FirstGuess:
         flight = y.copy()
         flight[: lattice.owned] += self.functional.t2 * problem.load / lattice.mass[:, None]
         surface = self.functional.surface
-        pressing = surface if surface is not None and surface.presses(q) else None
+        pressing = surface.contacts if surface and surface.start.count else None
         guesses = [y]
         # The flight's mean would lead through obstacles that press, and g is not
         # meaningful beyond them.
-        if pressing is None or not pressing.contacts.obstacles.total:
+        if pressing is None or not pressing.obstacles.total:
             guesses.append(q + self.drift(flight - q))
         if self.corrections:
             guesses.append(y + 2 * self.corrections[0] - self.corrections[-1])

@@ -71,19 +71,27 @@ class StepProblem:
 
 
 @dataclass(frozen=True)
-class Iterate:
-    """Iterate of a step: positions, and the residual and contact at these positions.
+class Place:
+    """Positions in a step, with the contact there.
 
-    x       : unknowns; no method writes to them
     q       : positions (l, 3) [m], ghosts included
-    f       : F [kg m]
     contact : contact at q; None without contact
     """
 
-    x: PETSc.Vec
     q: Positions
-    f: PETSc.Vec
     contact: StepContactAt | None
+
+
+@dataclass(frozen=True)
+class Iterate(Place):
+    """Iterate of a step: a place with its unknowns and residual.
+
+    x : unknowns; no method writes to them
+    f : F [kg m]
+    """
+
+    x: PETSc.Vec
+    f: PETSc.Vec
 
 
 class StepFunctional:
@@ -122,28 +130,30 @@ class StepFunctional:
         self.unknowns.to_nodes(x, q)
         return q
 
-    def evaluate(self, x: PETSc.Vec, f: PETSc.Vec, q: Positions | None = None) -> Iterate:
+    def place(self, q: Positions) -> Place:
+        """Return the place of positions q (l, 3) [m]."""
+        if not self.problem.contact:
+            return Place(q, None)
+        with CONTACT:
+            return Place(q, self.problem.contact.at(q))
+
+    def evaluate(self, x: PETSc.Vec, f: PETSc.Vec, place: Place | None = None) -> Iterate:
         """Return the iterate of x and write its F into f [kg m].
 
-        q : positions (l, 3) [m] of x if they are known
+        place : place of x if it is known
         """
         problem, gradient, owned = self.problem, self.scratch, self.lattice.owned
         with GRADIENT:
-            q = self.positions(x) if q is None else q
+            place = place or self.place(self.positions(x))
+            q = place.q
             gradient[:] = 0
             self.elasticity.add_gradient(q, gradient)
             gradient[:owned] -= problem.load
-            contact = None
-            if problem.contact:
+            if place.contact:
                 with CONTACT:
-                    contact = problem.contact.at(q)
-                    contact.add_gradient(gradient)
+                    place.contact.add_gradient(gradient)
             self.unknowns.scaled_sum(q[:owned] - problem.y[:owned], self.t2, gradient, f)
-        return Iterate(x, q, f, contact)
-
-    def contact_at(self, q: Positions) -> StepContactAt | None:
-        """Return the step's contact at positions q (l, 3) [m]; None without contact."""
-        return self.problem.contact.at(q) if self.problem.contact else None
+        return Iterate(q, place.contact, x, f)
 
     def at(self, q: Positions) -> Iterate:
         """Return the iterate whose free nodes are at q (l, 3) [m]."""
@@ -151,12 +161,12 @@ class StepFunctional:
         self.unknowns.from_nodes(q, x)
         return self.iterate(x)
 
-    def iterate(self, x: PETSc.Vec, q: Positions | None = None) -> Iterate:
+    def iterate(self, x: PETSc.Vec, place: Place | None = None) -> Iterate:
         """Return the iterate of x, a vector of the pool that the iterate keeps.
 
-        q : positions (l, 3) [m] of x if they are known
+        place : place of x if it is known
         """
-        iterate = self.evaluate(x, self.vectors.take(), q)
+        iterate = self.evaluate(x, self.vectors.take(), place)
         self.vectors.lend(iterate, iterate.x, iterate.f)
         return iterate
 
@@ -175,20 +185,21 @@ class StepFunctional:
         inertia = 0.5 * self._inner(moved, moved)
         return float(reduced(self.comm, inertia + self.t2 * acting))
 
-    def change(self, q: Positions, base: Positions) -> tuple[float, float]:
-        """Return g(q) - g(base) [kg m^2] and |q - base|^2 [m^2] of positions (l, 3) [m].
+    def change(self, place: Place, base: Place) -> tuple[float, float]:
+        """Return the change of g [kg m^2] from a base to a place, and |q - q_base|^2 [m^2].
 
         Differences are summed term by term, so that a small change keeps its digits.
         """
         problem, owned = self.problem, slice(self.lattice.owned)
+        q, before = place.q, base.q
         with ENERGY:
-            moved = q[owned] - base[owned]
-            twice = q[owned] + base[owned] - 2 * problem.y[owned]
+            moved = q[owned] - before[owned]
+            twice = q[owned] + before[owned] - 2 * problem.y[owned]
             inertia = 0.5 * self._inner(moved, twice)
-            elastic = self.elasticity.change(q, base) - float(np.vdot(moved, problem.load))
-            if problem.contact:
+            elastic = self.elasticity.change(q, before) - float(np.vdot(moved, problem.load))
+            if place.contact and base.contact:
                 with CONTACT:
-                    elastic += problem.contact.change(q, base)
+                    elastic += place.contact.change(base.contact)
             change, squared = reduced(
                 self.comm, [inertia + self.t2 * elastic, float(np.vdot(moved, moved))]
             )

@@ -8,7 +8,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Floats, Positions, greatest
+from msmpetsc.backend.arrays import Floats, greatest
 from msmpetsc.comm import reduced
 from msmpetsc.contact.step_contact import Duals, StepContact, StepContactAt
 from msmpetsc.errors import InputError
@@ -19,7 +19,7 @@ from msmpetsc.solve.linear.operators import (
     assemble,
     python_matrix,
 )
-from msmpetsc.solve.nonlinear.functional import StepFunctional
+from msmpetsc.solve.nonlinear.functional import Place, StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import (
     MASSLESS,
     MULTIGRID,
@@ -123,18 +123,13 @@ class Jacobian:
         diagonal: Floats = unknowns.inertia[unknowns.free] + self.functional.t2 * stiffness
         return diagonal
 
-    def linearise(
-        self,
-        q: Positions,
-        contact: StepContactAt | None,
-        projected: bool,
-        duals: Duals | None,
-    ) -> None:
-        """Linearise H and contact at positions q (l, 3) [m]; A is constant (collective).
+    def linearise(self, place: Place, projected: bool, duals: Duals | None) -> None:
+        """Linearise H and contact at a place; A is constant (collective).
 
         projected : leave out the negative parts of H
         duals     : duals of friction; None for its true curvature
         """
+        q, contact = place.q, place.contact
         if self.preset.true_hessian:
             self.hessian.linearise(q, contact, projected, duals)
         elif self.blocks:
@@ -147,29 +142,29 @@ class Jacobian:
 class FrictionDuals:
     """Dual unknowns of Newton's method: friction forces over their limits (contact.friction).
 
-    contact : contact of the step in progress; None without contact
-    duals   : duals for the next Hessian; None without contact. At the start of a step, nodes on
-              obstacles have zeros, which give the secants. Pairs of surfaces have None, which
-              gives their own forces
+    duals : duals for the next Hessian; None without contact. At the start of a step, nodes on
+            obstacles have zeros, which give the secants. Pairs of surfaces have None, which gives
+            their own forces
     """
 
     def __init__(self) -> None:
-        self.contact: StepContact | None = None
         self.duals: Duals | None = None
 
     def begin(self, contact: StepContact | None) -> None:
         """Begin a step."""
-        self.contact = contact
         self.duals = contact.no_duals() if contact else None
 
-    def update(self, q: Positions, base: Positions, is_full: bool) -> None:
-        """Update the duals after a step from base to q (l, 3) [m].
+    def update(
+        self, contact: StepContactAt | None, base: StepContactAt | None, is_full: bool
+    ) -> None:
+        """Update the duals after an iteration.
 
+        contact, base : contact after and before the iteration
         is_full : whether the step is the full Newton step; a shorter step resets the duals
         """
-        if self.contact is None or self.duals is None:
+        if contact is None or base is None or self.duals is None:
             return
         if is_full:
-            self.duals = self.contact.duals_after(q, base, self.duals)
+            self.duals = contact.duals_after(base, self.duals)
         else:
             self.duals = [None if known is None else np.zeros_like(known) for known in self.duals]

@@ -182,7 +182,7 @@ class Newton(StepMethod):
         """
         with LOCAL:
             duals = None if is_true else self.friction.duals
-            self.jacobian.linearise(now.q, now.contact, projected, duals)
+            self.jacobian.linearise(now, projected, duals)
             if self.slopes is not None and not projected:
                 self.jacobian.hessian.take_slopes(self.slopes)
             self.slopes = None
@@ -237,11 +237,11 @@ class Newton(StepMethod):
         while s > SHORTEST:
             x.waxpy(-s, self.y, now.x)
             with LOCAL:
-                q = self.functional.positions(x)
-                self.friction.update(q, now.q, s == 1.0)
-                change, _ = (-np.inf, 0.0) if flat else self.functional.change(q, now.q)
+                place = self.functional.place(self.functional.positions(x))
+                self.friction.update(place.contact, now.contact, s == 1.0)
+                change, _ = (-np.inf, 0.0) if flat else self.functional.change(place, now)
                 if change <= ALPHA * s * slope:
-                    return self.functional.iterate(x, q)
+                    return self.functional.iterate(x, place)
             s, longer = shorter(slope, (s, change), longer), (s, change)
         self.functional.vectors.give_back(x)
         return None

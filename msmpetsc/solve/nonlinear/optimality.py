@@ -78,7 +78,7 @@ class Optimality:
         corrected = examined is not None
         length = functional.norm(estimate.correction) if corrected else 0.0
         examined = examined or at
-        estimate.linearise(examined.q, examined.contact)
+        estimate.linearise(examined)
         estimate.residual.aypx(-1.0, examined.f)
         # Change of F that H at the iterate does not predict
         bent = functional.dual_norm(estimate.residual)
@@ -109,7 +109,7 @@ class Optimality:
         if not is_free:
             self.functional.vectors.give_back(x)
             return None
-        return self.functional.iterate(x, q)
+        return self.functional.iterate(x, self.functional.place(q))
 
     def _corrected(self, at: Iterate) -> tuple[PETSc.Vec, Positions, bool]:
         """Return the unknowns x - e, their positions (l, 3) [m], and whether the path is free.
@@ -153,7 +153,7 @@ class Optimality:
         The result is the point examined, or a point farther along a direction of negative
         curvature.
         """
-        falls = self.functional.change(verdict.examined.q, at.q)[0] < 0
+        falls = self.functional.change(verdict.examined, at)[0] < 0
         lower = verdict.examined if falls else None
         if verdict.direction is None:
             return lower
@@ -164,7 +164,7 @@ class Optimality:
 
         Return None if no move lowers g.
         """
-        functional, base = self.functional, at.q
+        functional = self.functional
         slope = reduced(functional.comm, float(self.memory.read(at.f) @ direction))
         longest = float(reduced(functional.comm, greatest(np.abs(direction)), MPI.MAX))
         move = FIRST_MOVE * functional.lattice.cell_size / longest
@@ -176,8 +176,8 @@ class Optimality:
         for _ in range(MOVES):
             self.memory.write(x)[:] = self.memory.read(at.x) + move * direction
             q = functional.positions(x)
-            is_free = functional.collision_free_step(base, q) == 1.0
-            change = functional.change(q, base)[0] if is_free else np.inf
+            is_free = functional.collision_free_step(at.q, q) == 1.0
+            change = functional.change(functional.place(q), at)[0] if is_free else np.inf
             if change < lowest:
                 best, lowest = move, change
                 move *= 2

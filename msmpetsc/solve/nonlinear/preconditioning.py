@@ -205,9 +205,9 @@ class LatticePreconditioner(StepPreconditioner):
         A kept hierarchy follows the contact of single nodes, since each node that has come into
         contact would cost several iterations.
         """
-        self.is_free, self.is_new = self._is_free(q, contact), self.is_stale
+        self.is_free, self.is_new = self._is_free(contact), self.is_stale
         if self.is_new:
-            surface = contact.surface.hessian(q, True) if contact and contact.surface else None
+            surface = contact.surface.projected_hessian if contact and contact.surface else None
             self._build(q.copy(), self._blocks(contact), surface)
         elif contact and not contact.surface:
             return self._follow(self._blocks(contact))
@@ -249,8 +249,8 @@ class LatticePreconditioner(StepPreconditioner):
         self.excess = 0.0
         self.is_first = self.is_stale = False
 
-    def _is_free(self, q: Positions, contact: StepContactAt | None) -> bool:
-        """Return whether mass alone resists translations of free bodies, at q (l, 3) [m].
+    def _is_free(self, contact: StepContactAt | None) -> bool:
+        """Return whether mass alone resists translations of free bodies.
 
         This holds if there are free bodies, and no contact presses on them.
         """
@@ -261,7 +261,7 @@ class LatticePreconditioner(StepPreconditioner):
             surface and surface.contacts.obstacles.total
         )
         # Self-contact of a single body does not move its centre, like springs
-        if surface and not alone and surface.presses(q):
+        if surface and not alone and surface.presses:
             return False
         return not reduced(self.unknowns.comm, contact.presses_nodes, MPI.LOR)
 

@@ -9,6 +9,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.comm import reduced
+from msmpetsc.contact.step_contact import StepContactAt
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.solid import NeoHookean
 from msmpetsc.errors import InputError
@@ -57,6 +58,7 @@ class StepResult:
                    (solve.energy_balance) [J]
     static       : whether the result is an equilibrium, not a motion
     time_error   : estimated error of the trajectory so far; NaN without an estimate
+    contact      : contact at ``position``; None without contact, or if explicit
     problem      : F = M (x - y) + tau^2 (grad E - f_ext), without M in statics; None if explicit
     energy_tolerance : energy [J]; if g / tau^2 is this close to its minimum, x meets the error
     tau          : tau of the problem [s]
@@ -75,6 +77,7 @@ class StepResult:
     swing: float = 0.0
     static: bool = False
     time_error: float = np.nan
+    contact: StepContactAt | None = None
     problem: StepProblem | None = None
     energy_tolerance: float = 0.0
     tau: float = np.inf
@@ -236,8 +239,9 @@ class Stepper:
             cost = replace(self.spent(), step_error=error)
             energy_tolerance = 0.5 * (self.control.target * distance) ** 2 / self.functional.t2
             return StepResult(
-                now.q, problem.q, cost, problem=problem, energy_tolerance=energy_tolerance
-            )
+                now.q, problem.q, cost,
+                contact=now.contact, problem=problem, energy_tolerance=energy_tolerance,
+            )  # fmt: skip
 
     def _begin(self, problem: StepProblem, start: Rows | None) -> Iterate:
         """Begin a step and return its first iterate."""

@@ -10,6 +10,8 @@ numba vectorises loops over the lanes, because all offsets into the work array a
 The formulas are in elasticity.cell_strain and elasticity.neo_hookean.
 """
 
+from typing import Any
+
 import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Positions, Rows
@@ -33,8 +35,14 @@ AT_STATE = CONSTANTS + ROWS * LANES
 RESULT = AT_STATE + STATE * LANES
 WORK = RESULT + 24 * LANES
 
-# numba's fastmath flags [-]; vectorisation needs sums that may be reordered
-FAST = {"contract", "nsz", "reassoc", "arcp"}
+# numba's options of loops over lanes. Vectorisation needs sums that may be reordered.
+# Inlined, a loop is optimised in its caller alone. Otherwise a run that compiles would
+# use another order than later runs.
+LANE_LOOP: Any = {
+    "fastmath": {"contract", "nsz", "reassoc", "arcp"},
+    "error_model": "numpy",
+    "forceinline": True,
+}
 
 
 @njit(inline="always")
@@ -80,7 +88,7 @@ def _load(rows: Rows, row: int, w: Floats, at: int) -> None:
         w[at + i] = rows[row, i]
 
 
-@njit(fastmath=FAST, error_model="numpy")
+@njit(**LANE_LOOP)
 def _product_lanes(w: Floats, projected: bool) -> None:
     for lane in range(LANES):
         k, e = CONSTANTS + lane, _strains_in(w, lane)
@@ -106,7 +114,7 @@ def add_product(blocks: CellBlocks, state: Rows, v: Rows, product: Rows) -> None
         _scatter(blocks.nodes, b, w, product)
 
 
-@njit(fastmath=FAST, error_model="numpy")
+@njit(**LANE_LOOP)
 def _gradient_lanes(w: Floats, h4: float, u: int) -> None:
     for lane in range(LANES):
         k, e = CONSTANTS + lane, _strains_in(w, lane)
@@ -125,7 +133,7 @@ def add_gradient(blocks: CellBlocks, q: Positions, gradient: Rows) -> None:
         _scatter(blocks.nodes, b, w, gradient)
 
 
-@njit(fastmath=FAST, error_model="numpy")
+@njit(**LANE_LOOP)
 def _change_lanes(w: Floats, inverse_h4: float) -> None:
     for lane in range(LANES):
         moved, base, s = _strains_in(w, lane), _strains_in(w, lane, RESULT), AT_STATE + lane

@@ -166,3 +166,27 @@ def test_kernels_of_a_folder_that_cannot_be_written_are_found(copied: Path, tmp_
 def test_every_kernel_is_kept_in_this_way():
     for path in PACKAGE.rglob("*.py"):
         assert path.name == "kernel.py" or "numba.njit" not in path.read_text(), path
+
+
+# Prints a product of a random block of cells, and the number of kernels found compiled
+PRODUCT = """
+import numpy as np
+from msmpetsc.elasticity.cell_blocks import LANES, PROJECTED, ROWS, CellBlocks
+from msmpetsc.elasticity.cell_lanes import add_product
+rng = np.random.default_rng(0)
+nodes = np.arange(8 * LANES, dtype=np.uint32).reshape(1, LANES, 8)
+around, which = np.empty((8, 0), np.int64), np.zeros(1, np.int32)
+constants, state, v = (
+    rng.uniform(0.5, 1.5, shape) for shape in ((1, ROWS * LANES), (1, PROJECTED * LANES), (64, 3))
+)
+product = np.zeros_like(v)
+add_product(CellBlocks(nodes, which, constants, around, 1, 0.1, 0), state, v, product)
+print(product.tobytes().hex(), sum(add_product.stats.cache_hits.values()))
+"""
+
+
+def test_a_run_that_compiles_computes_the_same_bits_as_later_runs(tmp_path: Path):
+    """LLVM reorders sums, so a function optimised on its own and in its caller gives other bits."""
+    given = ENVIRONMENT | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    first, then = (python("-c", PRODUCT, env=given).stdout.split() for _ in range(2))
+    assert (first[1], then[1]) == ("0", "1") and first[0] == then[0]

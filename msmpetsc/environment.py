@@ -1,6 +1,7 @@
 """The actions on a body at a given time: forces, anchors, obstacles and surface contact."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -113,11 +114,33 @@ class Environment:
             return None
         return ended.contact
 
+    def settle_contacts(
+        self, contact: StepContactAt | None, x: Positions, tolerance: float
+    ) -> tuple[StepContactAt | None, bool, bool]:
+        """Return the contact at a solution with all pairs of the surface, and whether it is right.
+
+        Also return whether the surface crosses nothing on the path to the solution (collective).
+
+        contact   : contact at the solution x (l, 3) [m], with the pairs used
+        tolerance : as in ContactSearch.end_step [J]
+        """
+        if not self.contacts:
+            return contact, True, True
+        surface = contact.surface if contact else None
+        used = surface.pairs if surface else None
+        is_free, is_right = self.contacts.end_step(used, x, tolerance)
+        if contact and surface and self.contacts.end:
+            contact = replace(contact, surface=replace(surface, pairs=self.contacts.end))
+        return contact, is_right, is_free
+
+    def narrow_contacts(self) -> None:
+        """Use only candidate pairs around the contacts at the last solution if these are few."""
+        if self.contacts and self.contacts.end:
+            self.contacts.narrow(self.contacts.end)
+
     def end_step(self, contact: StepContactAt | None) -> None:
         """Record the contact at the end of a step, from which friction continues."""
         self._ended = contact
-        if self.contacts and contact and contact.surface:
-            self.contacts.end = contact.surface.pairs
 
     def friction_lags(self, contact: StepContactAt | None) -> bool:
         """Return whether friction in a step used an outdated limit (collective).

@@ -13,7 +13,7 @@ from crossings import crossings
 
 import msmpetsc.contact.surface.pairs
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw
-from msmpetsc.contact.surface.pairs import ContactSearch
+from msmpetsc.contact.surface.pairs import LEFT_OUT, ContactSearch
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.surface import Surface
@@ -231,10 +231,10 @@ def test_what_stores_too_little_to_count_may_be_left_out(folder: Path, monkeypat
     for left_out, is_right in ((1.01, True), (0.99, False)):
         contacts.narrow(begun)
         assert contacts.is_left_out
-        assert contacts.check_narrow_step(None, end, left_out * energy) == (True, is_right)
-        assert contacts.is_narrow != is_right and not contacts.is_left_out
+        assert contacts.end_step(None, end, left_out * energy / LEFT_OUT) == (True, is_right)
+        assert not (contacts.is_narrow or contacts.is_left_out)
     assert contacts.summary(contacts.end).energy == pytest.approx(energy)
-    assert contacts.check_narrow_step(contacts.end, end, 0.0) == (True, True)
+    assert contacts.end_step(contacts.end, end, 0.0) == (True, True)
 
 
 def test_a_step_past_what_it_would_meet_is_solved_with_the_surface(

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Mask, Positions, Rows
+from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.comm import log, on_root, reduced
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw, CandidateSets, ContactSets
 from msmpetsc.contact.surface.continuous_collision import PIECE, collision_free_step
@@ -31,6 +31,9 @@ FARTHEST = 0.05
 # Share of points in contact from which second solves cost more than narrow steps save
 # [-]
 FEW = 0.01
+# Energy of pairs that may be left out of a step [energy tolerance of the step]; leaving
+# them out moves x by 0.01 of the error
+LEFT_OUT = 1e-4
 # Relative difference of two sums of contact energy that counts as rounding [-]
 SAME_ENERGY = 1e-9
 
@@ -138,16 +141,14 @@ class ContactSearch:
         self.start: ActivePairs | None = None
         self.end: ActivePairs | None = None
         self.is_narrow = self.is_left_out = False
-        # Candidates of a narrow step, and the points (p,) around which they are, on
-        # rank 0
+        # Candidates of a narrow step, on rank 0
         self._around: CandidateSets = ()
-        self._touched: Mask | None = None
         # The newest first
         self._known: list[CandidatePairs] = []
 
     def begin_step(self, q: Positions, begin: float, time: float) -> ActivePairs:
         """Begin a step from q between two times [s], with all candidates. Return the pairs at q."""
-        self.begin, self.time, self._touched = begin, time, None
+        self.begin, self.time = begin, time
         self.widen()
         self.start, self.end = self.of_step(q, begin), None
         return self.start
@@ -201,46 +202,40 @@ class ContactSearch:
         return ActivePairs(q, time, count, points, active)
 
     def narrow(self, pairs: ActivePairs) -> None:
-        """Use only candidates around the points of given pairs, and around earlier points.
-
-        If too many points touch, the step uses all candidates.
-        """
-        touched = None
-        if self.barrier and pairs.count:
-            touched = self.pushes(pairs).any(axis=1)
-            touched = touched if self._touched is None else touched | self._touched
-        self.is_narrow = self.comm.bcast(touched is None or touched.mean() < FEW)
-        self._touched, self.is_left_out = touched, self.is_narrow and pairs.count == 0
+        """Use only candidates around the points of given pairs, unless too many points touch."""
+        touched = self.pushes(pairs).any(axis=1)
+        self.is_narrow = self.comm.bcast(bool(pairs.count == 0 or touched.mean() < FEW))
+        self.is_left_out = self.is_narrow and pairs.count == 0
         if self.is_narrow and not self.is_left_out:
             points = self.points(pairs.q, self.time)
-            if self.barrier and touched is not None:
+            if self.barrier:
                 self._around = self.barrier.around(touched, points, FARTHEST * self.edge)
 
     def widen(self) -> None:
         """Use all candidates from now on."""
         self.is_narrow = self.is_left_out = False
 
-    def check_narrow_step(
-        self, used: ActivePairs | None, x: Positions, left_out: float
+    def end_step(
+        self, used: ActivePairs | None, x: Positions, tolerance: float
     ) -> tuple[bool, bool]:
-        """Return whether the path of a narrow step to x is free, and whether x is right.
+        """Return whether the path to the solution x is free, and whether x is right (collective).
 
-        The solution x is right if the contact energy of all pairs is within ``left_out`` [J] of the
-        energy of the pairs used. Afterwards the step uses all candidates. But if the path is free
-        and x is not right, the step stays narrow, with the candidates around all contacts at x.
+        A solution of a narrow step is right if the path is free, and if all pairs have nearly the
+        energy of the pairs used. Afterwards the step uses all candidates.
 
-        used : pairs of the step at x; None if the surface was left out
+        used      : pairs of the step at x; None if the surface was left out
+        tolerance : energy [J]; if g / tau^2 is this close to its minimum, x meets the error
         """
+        if not self.is_narrow:
+            self.end = used
+            return True, True
         assert self.start is not None
         energy = self.summary(used).energy if used else 0.0
         self.widen()
         free = self.collision_free_step(self.start.q, x, self.begin) == 1.0
         self.end = self.find(x)
-        of_all = self.summary(self.end).energy
-        is_right = free and abs(of_all - energy) <= SAME_ENERGY * energy + left_out
-        if free and not is_right:
-            self.narrow(self.end)
-        return free, is_right
+        missing = abs(self.summary(self.end).energy - energy)
+        return free, free and missing <= SAME_ENERGY * energy + LEFT_OUT * tolerance
 
     def same(self, begin: float, end: float) -> bool:
         """Return whether obstacles have the same places at two times [s]."""

@@ -37,9 +37,6 @@ from msmpetsc.solve.work import Work
 # greatest number of solves until a step's contact faces are right; wrong faces let
 # nodes pass through a thin obstacle
 MOST_SOLVES = 10
-# energy of surface pairs that may be left out [energy tolerance of the step]; leaving
-# them out moves x by 0.01 of the error
-LEFT_OUT = 1e-4
 
 
 @dataclass
@@ -50,9 +47,9 @@ class ContactFaces:
     solution x crosses faces that give other forces, the step is solved again. From then on a node
     keeps its face, so that the search ends.
 
-    If the surface has few contacts at the start, the first solves use only candidate pairs around
+    If the surface has few contacts at the start, the first solve uses only candidate pairs around
     these contacts, and no pairs without contacts. If the solution shows other contacts, the step is
-    solved again. So no iterate needs a broad phase.
+    solved again with all candidates.
 
     q, y       : as in StepProblem
     load       : external forces
@@ -118,12 +115,11 @@ class ContactFaces:
 
         Raises StepFailed if the faces do not settle in MOST_SOLVES solves.
         """
-        x, self.contact = result.position, result.contact
+        x = result.position
         crossed, pressing = self._crossed(x), self.environment.obstacles.pressing
         sides = np.where(self.sides > 0, self.sides, crossed) if self.solves else crossed
         self.solves += 1
-        environment, contacts = self.environment, self.environment.contacts
-        obstacles = environment.obstacles
+        environment, obstacles = self.environment, self.environment.obstacles
         self.is_settled = not obstacles.has_sides or obstacles.same_push(
             x, self.time, self.sides, sides
         )
@@ -137,26 +133,17 @@ class ContactFaces:
                     "contact",
                 )
             return
-        narrow = contacts if contacts and contacts.is_narrow else None
-        if narrow:
-            surface = result.contact.surface if result.contact else None
-            used = surface.pairs if surface else None
-            left_out = LEFT_OUT * result.energy_tolerance
-            with CONTACT:
-                is_free, self.is_settled = narrow.check_narrow_step(used, x, left_out)
-            if result.contact and surface and narrow.end:
-                of_all = replace(surface, pairs=narrow.end)
-                self.contact = replace(result.contact, surface=of_all)
-            if not self.is_settled:
-                self.start = x if is_free else None
-                if self.solves >= MOST_SOLVES:
-                    narrow.widen()
-                return
+        with CONTACT:
+            self.contact, self.is_settled, is_free = environment.settle_contacts(
+                result.contact, x, result.energy_tolerance
+            )
+        if not self.is_settled:
+            self.start = x if is_free else None
+            return
         if self.end is None and environment.friction_lags(self.contact):
             self.end, self.start = self.contact, x
             self.is_settled = False
-            if narrow and narrow.end:
-                narrow.narrow(narrow.end)
+            environment.narrow_contacts()
             return
         # Reflecting obstacles use the faces crossed on the path to x.
         if obstacles.penalties:

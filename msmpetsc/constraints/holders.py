@@ -18,7 +18,7 @@ the sum of reactions, loads and pushes is the sum of m a.
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial, reduce
+from functools import reduce
 from itertools import chain
 
 import numpy as np
@@ -28,8 +28,7 @@ from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like
 from msmpetsc.comm import log
 from msmpetsc.constraints.anchors import Anchor
 from msmpetsc.errors import InputError
-from msmpetsc.geometry.partition import places_of
-from msmpetsc.lattice.lattice import Lattice, MadeSprings
+from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.region import Finder
 from msmpetsc.scene.reading import Scene
 
@@ -165,31 +164,7 @@ def _with_cut_cells(
     factor[cut] = (np.bincount(cell) / np.maximum(np.bincount(cell, sigma_theta), LEAST**2))[cut]
     solid = lattice.solid
     solid = solid._replace(shear=factor * solid.shear, lame=factor * solid.lame)
-    assert lattice.make_springs is not None
-    stiffer = partial(
-        _stiffer_springs, lattice.make_springs, len(lattice.nodes), corners[cut], factor[cut]
-    )
-    return replace(lattice, solid=solid, make_springs=stiffer)
-
-
-def _stiffer_springs(
-    make_springs: Callable[[], MadeSprings], count: int, corners: Indices, factor: Floats
-) -> MadeSprings:
-    """Return the springs, stiffened so that their L still bounds the stiffened cells (collective).
-
-    A spring takes the greatest factor of the cells that contain both its ends.
-
-    count   : number of local nodes
-    corners : corner nodes (c, 8) of cells with a factor (c,) of at least 1
-    """
-    springs = make_springs()
-    pairs = count * corners.astype(np.int64)[:, :, None] + corners[:, None, :]
-    keys, pair = np.unique(pairs, return_inverse=True)
-    most = np.ones(len(keys) + 1)
-    np.maximum.at(most, pair.ravel(), np.repeat(factor, 64))
-    # the last entry, 1, is the factor of pairs in other cells
-    ends = count * springs.ends[:, 0].astype(np.int64) + springs.ends[:, 1]
-    return springs._replace(stiffness=most[places_of(keys, ends)] * springs.stiffness)
+    return replace(lattice, solid=solid)
 
 
 def _free_fraction(within: Within, start: Positions, end: Positions) -> Floats:

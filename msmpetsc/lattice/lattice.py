@@ -48,11 +48,15 @@ NO_SPRINGS = MadeSprings(np.empty((0, 2), np.int32), np.empty(0), np.empty(0))
 
 
 def _springs_of_solid(
-    net: Topology, h: float, material: Material, of_cells: MaterialOfCells | None
+    net: Topology, h: float, order: Indices | slice, solid: SolidCells
 ) -> MadeSprings:
-    """Return the springs whose L bounds a solid's Hessian at rest (collective)."""
+    """Return the springs whose L bounds a solid's Hessian at rest.
+
+    order : (d,) row of ``solid`` for each cell of the topology
+    """
     springs = net.springs()
-    return MadeSprings.of(springs, h, stiffness_of_solid(net, springs, h, material, of_cells))
+    cells = SolidCells(*(to_host(rows)[order] for rows in solid))
+    return MadeSprings.of(springs, h, stiffness_of_solid(net, springs, h, cells))
 
 
 @dataclass(frozen=True)
@@ -81,7 +85,7 @@ class Lattice:
     volumetric  : name of a solid's volumetric energy (elasticity.neo_hookean)
     viscous     : beta / tau [-], viscosity of a step over the stiffness (elasticity.viscosity)
     pressed     : surfaces under pressure (lattice.embedded_surface.SurfacePart)
-    make_springs : function that makes the springs of a solid (collective); None if they are made
+    make_springs : function that makes the springs of a solid from ``solid``; None if they are made
     """
 
     table: SortedKeys
@@ -106,7 +110,7 @@ class Lattice:
     volumetric: str = "quadratic"
     viscous: float = 0.0
     pressed: tuple[Any, ...] = ()
-    make_springs: Callable[[], MadeSprings] | None = None
+    make_springs: Callable[[SolidCells], MadeSprings] | None = None
 
     @property
     def owned(self) -> int:
@@ -150,13 +154,13 @@ class Lattice:
         return np.nonzero(self.fixed & ~self.pinned[:, None])
 
     def with_springs(self) -> "Lattice":
-        """Return this lattice with its springs (collective).
+        """Return this lattice with its springs.
 
         The springs of a solid are no part of its energy: their L bounds its Hessian at rest.
         """
-        if self.make_springs is None:
+        if self.make_springs is None or self.solid is None:
             return self
-        springs = self.make_springs()
+        springs = self.make_springs(self.solid)
         return replace(
             self,
             springs=springs.ends,
@@ -188,11 +192,13 @@ def build_lattice(
     further = ~first_owned & is_solid
     # a slice copies nothing, so that whole cells still share one row of constants
     kept: Indices | slice = slice(None)
+    order: Indices | slice = slice(None)
     if not first_owned.all():
         kept = np.concatenate([np.flatnonzero(first_owned), np.flatnonzero(further)])
+        order = np.argsort(kept)
     springs, make_springs = NO_SPRINGS, None
     if is_solid:
-        make_springs = partial(_springs_of_solid, net, h, material, of_cells)
+        make_springs = partial(_springs_of_solid, net, h, order)
         law, springs_owned = law_of_solid(net, h, material, of_cells), net.count_springs()
     else:
         found = net.springs()

@@ -131,24 +131,15 @@ def law_of_solid(
     return LawConstants(mass, edge_stiffness(volume * made_of.spring, h), np.empty(0), cells)
 
 
-def stiffness_of_solid(
-    net: Topology,
-    springs: SpringNet,
-    h: float,
-    material: Material,
-    of_cells: MaterialOfCells | None,
-) -> Floats:
-    """Return the stiffness (s,) [N/m] of the springs whose L bounds a solid (collective)."""
-    made_of, *parts = _made_of(net, material, of_cells)
-    shear, lame = lame_constants(made_of.spring, made_of.poisson)
-    count = len(net.cells)
-    pairs = np.broadcast_to(laplacians(WHOLE[None], np.ones(1)), (count, 8, 8))
-    forms, volume, cut = _forms(*parts)
+def stiffness_of_solid(net: Topology, springs: SpringNet, h: float, cells: SolidCells) -> Floats:
+    """Return the stiffness (s,) [N/m] of the springs whose L bounds a solid."""
+    pairs = np.broadcast_to(laplacians(WHOLE[None], np.ones(1)), (len(net.cells), 8, 8))
+    cut = np.flatnonzero((cells.forms != WHOLE).any(axis=1))
     if len(cut):
         pairs = pairs.copy()
-        pairs[cut] = bounding_laplacians(forms[cut], volume[cut])
+        pairs[cut] = bounding_laplacians(cells.forms[cut], cells.volume[cut] / h**3)
     # (2 mu + 3 lambda) |grad u|^2 bounds the second variation at rest
-    return _sums_of_springs(net, springs, -h * (2 * shear + 3 * lame), pairs)
+    return _sums_of_springs(net, springs, -h * (2 * cells.shear + 3 * cells.lame), pairs)
 
 
 def _forms(fills: Rows, moments: Rows) -> tuple[Rows, Floats, Indices]:

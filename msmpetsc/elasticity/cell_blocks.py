@@ -82,20 +82,23 @@ def one_by_one(blocks: CellBlocks, state: Array | None = None) -> CellRows:
     return CellRows(nodes, blocks.which, constants, blocks.h4, blocks.u, by_node, own, width)
 
 
-def blocks_of(lattice: Lattice, constants: Rows, u: int) -> CellBlocks:
+def blocks_of(lattice: Lattice, constants: Rows, u: int) -> tuple[CellBlocks, Indices]:
     """Return the lattice's cells with their constants (c, ROWS), on the device of its nodes.
 
-    Cells with equal constants are put into the same blocks, so that few distinct rows are stored.
+    Also return the place (c,) of each cell in the sequence of blocks. Cells with equal constants
+    are put into the same blocks, so that few distinct rows are stored.
     """
     cells = to_host(lattice.local_cells)[:, BY_AXIS]
     number = np.arange(len(constants))
-    kinds = []
+    kinds: list[tuple[Indices, Rows]] = []
+    places = np.empty(len(constants), np.int64)
     _, alike, count = np.unique(whole_rows(constants), return_inverse=True, return_counts=True)
     # Cells whose constants are too rare to fill a block keep their order, for locality.
     rank = np.where(count[alike] < LANES, len(count), alike)
     for kind in (number < lattice.cells_owned, number >= lattice.cells_owned):
         own = np.flatnonzero(kind)
         order = own[np.argsort(rank[own], kind="stable")]
+        places[order] = LANES * sum(len(nodes) for nodes, _ in kinds) + np.arange(len(order))
         kinds.append(_in_blocks(cells[order], constants[order]))
     nodes, rows = (np.concatenate(parts) for parts in zip(*kinds, strict=True))
     _, first, which = np.unique(whole_rows(rows), return_index=True, return_inverse=True)
@@ -107,7 +110,8 @@ def blocks_of(lattice: Lattice, constants: Rows, u: int) -> CellBlocks:
         around = rows_of(corners.ravel().astype(np.int64), lattice.owned)
     arrays = nodes, which.astype(np.int32), rows[first], around
     nodes, which, distinct, around = (like(lattice.nodes, array) for array in arrays)
-    return CellBlocks(nodes, which, distinct, around, len(kinds[0][0]), 4 * lattice.cell_size, u)
+    owned, h4 = len(kinds[0][0]), 4 * lattice.cell_size
+    return CellBlocks(nodes, which, distinct, around, owned, h4, u), places
 
 
 def _in_blocks(nodes: Indices, constants: Rows) -> tuple[Indices, Rows]:

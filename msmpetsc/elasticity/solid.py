@@ -177,9 +177,13 @@ class CellHessians:
 
 @dataclass(frozen=True)
 class NeoHookean:
-    """A neo-Hookean solid: the cells around the nodes that this rank owns."""
+    """A neo-Hookean solid: the cells around the nodes that this rank owns.
+
+    places : (c,) place of each of the lattice's ``local_cells`` in the sequence of blocks
+    """
 
     blocks: CellBlocks
+    places: Indices
 
     @classmethod
     def of_lattice(cls, lattice: Lattice) -> "NeoHookean":
@@ -192,7 +196,7 @@ class NeoHookean:
         constants = np.concatenate(
             [forms[:, :6], modes, m, (lame * volume / h4**2)[:, None]], axis=1
         )
-        return cls(blocks_of(lattice, constants, VOLUMETRIC.index(lattice.volumetric)))
+        return cls(*blocks_of(lattice, constants, VOLUMETRIC.index(lattice.volumetric)))
 
     @property
     def corners(self) -> Indices:

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from msmpetsc.backend.arrays import Floats, Positions, Rows, to_host
-from msmpetsc.elasticity.cell_blocks import BY_AXIS, STATE, whole_rows
+from msmpetsc.elasticity.cell_blocks import STATE
 from msmpetsc.elasticity.cell_strain import LANES
 from msmpetsc.elasticity.cell_threads import cell_changes
 from msmpetsc.elasticity.neo_hookean import ONSET
@@ -30,7 +30,6 @@ UPPER = np.array([0, 4, 8, 1, 5, 2])
 class StressField:
     """The stress fields of a frame (fields.Frame), for this rank's part of a lattice.
 
-    lanes  : (d,) index of each of the lattice's ``local_cells`` in the solid's blocks
     around : (owned, d) sparse matrix, weights of the cells around each node; rows sum to 1
     """
 
@@ -38,14 +37,7 @@ class StressField:
         assert lattice.solid is not None
         self.solid, self.cells, self.cells_owned = solid, lattice.solid, lattice.cells_owned
         self.rest = lattice.nodes
-        corners, of_blocks = to_host(lattice.local_cells), to_host(solid.blocks.nodes)
-        # The first occurrence of a cell comes before the copies that fill up a block.
-        # Cells at the closed end of a slit may share their first corner.
-        of_blocks = of_blocks.reshape(-1, 8)
-        of_lattice = corners[:, BY_AXIS].astype(of_blocks.dtype)
-        every = whole_rows(np.concatenate([of_blocks, of_lattice]))
-        _, first, number = np.unique(every, return_index=True, return_inverse=True)
-        self.lanes = first[number[len(of_blocks) :]]
+        corners = to_host(lattice.local_cells)
         weights, number = np.repeat(self.cells.volume, 8), np.repeat(np.arange(len(corners)), 8)
         around = csr_array(
             (weights, (corners.ravel(), number)), shape=(len(lattice.nodes), len(corners))
@@ -60,7 +52,8 @@ class StressField:
         at rest. The factor 1 / J is at most 1 / J_0, so that the stress stays finite.
         """
         rows = to_host(self.solid.hessian_at(q, False).state)
-        state = rows.reshape(-1, STATE, LANES).transpose(0, 2, 1).reshape(-1, STATE)[self.lanes]
+        places = self.solid.places
+        state = rows.reshape(-1, STATE, LANES).transpose(0, 2, 1).reshape(-1, STATE)[places]
         f = state[:, :9].reshape(-1, 3, 3)
         slope = state[:, 9] * self.solid.blocks.h4**2 / self.cells.volume
         share = self.cells.shear / np.maximum(np.linalg.det(f), ONSET)
@@ -69,7 +62,7 @@ class StressField:
         energies = cell_changes(
             self.solid.blocks, LANES * len(self.solid.blocks.nodes), q, self.rest
         )
-        energies = to_host(energies)[self.lanes] / self.cells.volume
+        energies = to_host(energies)[places] / self.cells.volume
         own = slice(self.cells_owned)
         of_nodes = _fields(self.around @ stress, self.around @ energies)
         return of_nodes | {

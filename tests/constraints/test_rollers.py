@@ -35,7 +35,6 @@ LIFT = {
     "stop": 0.03,
 }
 SYMMETRIC = {"pin": [CLAMP], "gravity": {"acceleration": [0.5, 0, -9.81]}, "material": SOLID}
-FLOOR = plane_at(-0.002)
 CASES = {
     "static, multigrid": {"time": {"integrator": "static"}, "solver": MULTIGRID},
     "static, springs": {

@@ -13,10 +13,10 @@ from scipy.linalg import expm
 from scipy.optimize import brentq
 from scipy.sparse import coo_array, csc_array, diags
 from scipy.sparse.linalg import LinearOperator, eigsh, splu
+from surfaces import body_of
 
 from msmpetsc.elasticity.energy import Elasticity
-from msmpetsc.geometry.cages import BodySurface, fill
-from msmpetsc.geometry.surface import Surface, examine
+from msmpetsc.geometry.cages import fill
 from msmpetsc.lattice.lattice import Lattice, build_lattice
 from msmpetsc.scene.body import Material
 from msmpetsc.solve.nonlinear.functional import StepProblem
@@ -56,13 +56,9 @@ def lattice_of(
     offset: Iterable[float] = (0, 0, 0),
 ) -> Lattice:
     """Return the lattice of a mesh in a grid that begins ``offset`` (3,) cells before the mesh."""
-    surface = Surface(np.array(mesh.vertices), np.array(mesh.faces))
-    bounds = np.array(
-        [surface.points.min(axis=0) - h * np.array(offset), surface.points.max(axis=0)]
-    )
-    cages = fill(
-        [BodySurface(MPI.COMM_SELF, surface, examine(surface), bounds)], h, boundary=boundary
-    )
+    body = body_of(mesh)
+    body.bounds[0] -= h * np.array(offset)
+    cages = fill([body], h, boundary=boundary)
     law = (
         {"law": "linear"}
         if poisson is SPRINGS

@@ -5,7 +5,7 @@ import trimesh
 from mpi4py import MPI
 
 from msmpetsc.geometry.cages import BodySurface
-from msmpetsc.geometry.surface import Surface, examine
+from msmpetsc.geometry.surface import Surface, bounds_of, examine
 
 
 def surface_of(mesh: trimesh.Trimesh) -> Surface:
@@ -14,5 +14,4 @@ def surface_of(mesh: trimesh.Trimesh) -> Surface:
 
 def body_of(mesh: trimesh.Trimesh | Surface) -> BodySurface:
     surface = mesh if isinstance(mesh, Surface) else surface_of(mesh)
-    bounds = np.array([surface.points.min(axis=0), surface.points.max(axis=0)])
-    return BodySurface(MPI.COMM_SELF, surface, examine(surface), bounds)
+    return BodySurface(MPI.COMM_SELF, surface, examine(surface), bounds_of(surface))

@@ -191,9 +191,7 @@ def test_a_swirl_is_constant_beyond_its_table(tmp_path: Path):
 
 def hung(folder: Path, name: str, **tables) -> Path:
     """Return the scene of a block that hangs by its side."""
-    material = solid_of(2e4)
-    gravity = GRAVITY
-    tables = {"pin": NEAR, "material": material, "gravity": gravity} | tables
+    tables = {"pin": NEAR, "material": solid_of(2e4), "gravity": GRAVITY} | tables
     return block_scene(folder, name=name, **tables)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from mpi4py import MPI
 
 from msmpetsc.geometry.cages import BodySurface, fill
-from msmpetsc.geometry.surface import Surface, examine
+from msmpetsc.geometry.surface import Surface, bounds_of, examine
 
 comm = MPI.COMM_WORLD
 FILLED = [("closed", 0.11), ("open", 0.11), ("one cell", 2.5)]
@@ -17,8 +17,8 @@ def body_of(path: Path) -> BodySurface:
     """Return a body from points and triangles in an .npz file, which only rank 0 holds."""
     data = np.load(path)
     surface = Surface(data["points"], data["triangles"])
-    bounds = np.array([surface.points.min(axis=0), surface.points.max(axis=0)])
-    return BodySurface(comm, surface if comm.rank == 0 else None, examine(surface), bounds)
+    own = surface if comm.rank == 0 else None
+    return BodySurface(comm, own, examine(surface), bounds_of(surface))
 
 
 def fill_to_file(mesh: Path, cell_size: float) -> None:

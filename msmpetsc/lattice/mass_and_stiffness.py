@@ -10,20 +10,14 @@ import numpy as np
 from msmpetsc.backend.arrays import Array, Floats, Indices, Rows
 from msmpetsc.backend.kernel import njit
 from msmpetsc.lattice.cell_moments import WHOLE, bounding_laplacians, forms_of, laplacians
-from msmpetsc.lattice.cut_cells import mass_fractions, spring_fractions
+from msmpetsc.lattice.cut_cells import STRENGTH, mass_fractions, spring_fractions
 from msmpetsc.lattice.material import (
     CellMaterial,
     MaterialOfCells,
-    calibrated_stiffness,
     edge_stiffness,
     lame_constants,
 )
-from msmpetsc.lattice.topology import (
-    DIRECTION,
-    DIRECTION_KIND,
-    SpringNet,
-    Topology,
-)
+from msmpetsc.lattice.topology import DIRECTION, SpringNet, Topology
 from msmpetsc.scene.body import Material
 
 
@@ -81,13 +75,12 @@ def law_of_springs(
     of_pairs = spring_fractions(fills)
     of_corners = made_of.density[:, None] * mass_fractions(of_pairs)
     mass = h**3 / 8 * np.bincount(net.cells.ravel(), of_corners.ravel(), owned)[:owned]
-    of_spring = _sums_of_springs(net, springs, made_of.spring, of_pairs) / springs.sharing
-    law = LawConstants(mass, fills.mean(axis=1) * made_of.spring, of_spring)
+    cells = fills.mean(axis=1) * made_of.spring
     if material.stiffness is not None:
-        return law
-    kind = DIRECTION_KIND[springs.direction]
-    stiffness = calibrated_stiffness(law.springs, h, kind, springs.sharing)
-    return LawConstants(law.mass, edge_stiffness(law.cells, h), stiffness)
+        sums = _sums_of_springs(net, springs, made_of.spring, of_pairs)
+        return LawConstants(mass, cells, sums / springs.sharing)
+    sums = _sums_of_springs(net, springs, made_of.spring, STRENGTH * of_pairs)
+    return LawConstants(mass, edge_stiffness(cells, h), edge_stiffness(sums, h))
 
 
 def _made_of(

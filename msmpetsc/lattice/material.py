@@ -57,24 +57,6 @@ class CellMaterial:
 MaterialOfCells = Callable[[Indices], CellMaterial]
 
 
-def calibrated_stiffness(
-    young_modulus: Floats, cell_size: float, kind: Indices, cells: Indices
-) -> Floats:
-    """Return the stiffness (s,) [N/m] of springs that form an isotropic lattice at small strain.
-
-    The stiffness is a sum over the cells that share the spring, so it is less on the boundary.
-
-    young_modulus : E [Pa]; (s,) the mean over the cells that share each spring if cells differ
-    cell_size     : h [m]
-    kind          : (s,) squared length in cells
-    cells         : (s,) number of valid cells that share the spring
-    """
-    stiffness: Floats = (
-        edge_stiffness(young_modulus, cell_size) * ISOTROPIC[kind] * cells / CELLS_AROUND[kind]
-    )
-    return stiffness
-
-
 def lame_constants(young_modulus: Floats, poisson: Floats) -> tuple[Floats, Floats]:
     """Return Lame's constants mu and lambda [Pa]; Poisson's ratio must be below 1/2."""
     shear = young_modulus / (2 * (1 + poisson))

@@ -1,4 +1,4 @@
-"""Write the checkpoints of a run when they are due; the file stores them (results.writer)."""
+"""Write the checkpoints of a run, and its XDMF file, when they are due (results.writer)."""
 
 from collections.abc import Iterator
 from time import perf_counter
@@ -6,21 +6,22 @@ from typing import TYPE_CHECKING
 
 from mpi4py import MPI
 
-from msmpetsc.comm import Stop
+from msmpetsc.comm import Stop, on_root
 from msmpetsc.errors import StepStopped
 from msmpetsc.fields import Frame
 from msmpetsc.results.writer import ResultFile
+from msmpetsc.results.xdmf import write_xdmf
 
 # for type checkers only: PETSc must get its options before it is imported
 if TYPE_CHECKING:
     from msmpetsc.solve.simulate import TimeLoop
 
-# fraction of the run time that checkpoints may take [-]; hardly noticed
+# fraction of the run time that checkpoints and XDMF may take [-]; hardly noticed
 CHECKPOINT_TIME = 0.01
 
 
 class Checkpoints:
-    """Writer of a run's checkpoints: at the first and last step, when due, and at a signal.
+    """Writer of checkpoints and XDMF: at the first and last step, when due, and at a signal.
 
     every  : frames between checkpoints; None for an interval that takes CHECKPOINT_TIME of the run
     signal : number of the signal that ended the run before its last step; 0 if there was none
@@ -66,6 +67,7 @@ class Checkpoints:
                 self._written = saved.step
             if simulation.step == simulation.steps != saved.step:
                 self.file.write_checkpoint(simulation.end)
+            on_root(self.comm, lambda: write_xdmf(self.file.path))
             self._frames = 0
             self._ended = perf_counter()
             self._interval = (self._ended - began) / CHECKPOINT_TIME

@@ -38,7 +38,7 @@ from msmpetsc.fields import Frame
 from msmpetsc.results.checkpoint_reader import Earlier, end_of_run
 from msmpetsc.results.progress_bar import Progress
 from msmpetsc.results.writer import Begin, ResultFile, write_model
-from msmpetsc.results.xdmf import GrowingXdmf, write_xdmf
+from msmpetsc.results.xdmf import write_xdmf
 from msmpetsc.scene.reading import Scene, load_scene
 from msmpetsc.scene.schema import Solver
 from msmpetsc.solve.instrumentation import event_times
@@ -119,7 +119,6 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> tuple[Checkpoints, Cost, S
                 cost = Cost(comm, simulation, perf_counter() - plan.began)
                 numbers = count(start_output(comm, plan, file, model, simulation))
                 checkpoints = Checkpoints(comm, file, simulation, plan.request.checkpoint_every)
-                xdmf = GrowingXdmf(plan.request.path)
                 is_shown = comm.rank == 0 and log.isEnabledFor(logging.INFO)
                 set_up.close()
                 with closing(Progress(simulation.steps, is_shown)) as progress:
@@ -132,7 +131,6 @@ def take_steps(comm: MPI.Intracomm, plan: RunPlan) -> tuple[Checkpoints, Cost, S
                             # a resumed file has frames up to its checkpoint already
                             if frame is not None and next(numbers) >= file.finished:
                                 file.append(frame)
-                                on_root(comm, xdmf.update)
                             stops = checkpoints.after_step(frame is not None)
                             if frame is not None:
                                 for observe in observers:

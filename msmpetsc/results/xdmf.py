@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from time import perf_counter
 from xml.sax.saxutils import escape
 
 import numpy as np
@@ -13,24 +12,7 @@ from msmpetsc.results.disk import write_whole
 from msmpetsc.results.reader import Result
 
 NUMBER_TYPES = {"f": "Float", "i": "Int", "u": "UInt"}
-# share of a run's time for updates of the XDMF file [-]; hardly slows the run
-SHARE = 0.05
 HEAD = '<?xml version="1.0" encoding="utf-8"?>\n<Xdmf Version="3.0"><Domain>'
-
-
-class GrowingXdmf:
-    """The XDMF file beside a result that is being written."""
-
-    def __init__(self, h5_path: Path):
-        self._path, self._due = h5_path, 0.0
-
-    def update(self) -> None:
-        """Write the file for the frames finished by now, if it is due. Raises InputError."""
-        began = perf_counter()
-        if began >= self._due:
-            write_xdmf(self._path)
-            ended = perf_counter()
-            self._due = ended + (ended - began) / SHARE
 
 
 def write_xdmf(h5_path: str | Path) -> Path:

@@ -3,7 +3,6 @@
 import fcntl
 import io
 import os
-import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -152,12 +151,9 @@ def refuse_small_disk(path: Path, planned: int) -> None:
 
 @contextmanager
 def plain_errors(path: Path) -> Iterator[None]:
-    """Turn errors of the file system and of HDF5 into an InputError of a single line."""
+    """Turn errors of the file system into an InputError of a single line."""
     try:
         yield
-    except (OSError, RuntimeError, ValueError) as error:
-        message = re.search(r"error message = '([^']*)'", str(error))
-        if not message and not isinstance(error, OSError):
-            raise
-        reason = message[1] if message else getattr(error, "strerror", None) or one_line(error)
+    except OSError as error:
+        reason = error.strerror or one_line(error)
         raise InputError(f"{path} cannot be written: {reason}") from error

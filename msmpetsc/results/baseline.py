@@ -47,7 +47,6 @@ class Recipe(_Strict):
     """The options of the run that gives the numbers of a scene.
 
     cells   : cages.count; None for the scene's own
-    error   : relative error of each step
     steps   : number of steps from the start
     changes : changes of the scene as values of ``--set``
     """
@@ -55,7 +54,6 @@ class Recipe(_Strict):
     cells: Annotated[int, Field(ge=1)] | None = Field(
         validation_alias="cells asked for", serialization_alias="cells asked for"
     )
-    error: float = ERROR
     steps: int = Field(ge=1, le=MOST_STEPS)
     changes: list[str] = []
 

@@ -16,8 +16,8 @@ from msmpetsc.results.comparison import compare_surfaces, refuse_different_latti
 from msmpetsc.results.reader import Result
 from msmpetsc.study.table import Row
 
-# sums per frame in a result file; files of older versions lack "products"
-COUNTED = ("iterations", "ksp_its", "products")
+# sums per frame in a result file
+SUMMED = ("wall_time", "iterations", "ksp_its", "products")
 
 
 # ---- the measure file, written by ``msmpetsc run --measure``
@@ -59,8 +59,7 @@ def frame_metrics(result: Path, time_step: float) -> Row:
     steps = np.rint(np.diff(series["time"]) / time_step).astype(int)
     # frame 0 is the initial state; frame 1 contains work that is done once
     start = 2 if count > 2 else 1
-    known = [name for name in ("wall_time", *COUNTED) if name in series]
-    mean = {name: float(series[name][start:].sum() / steps[start - 1 :].sum()) for name in known}
+    mean = {name: float(series[name][start:].sum() / steps[start - 1 :].sum()) for name in SUMMED}
     row = {"frames": count, "steps": int(steps.sum()), "time_frame": mean.pop("wall_time"), **mean}
     row["most_iterations"] = float((series["iterations"][1:] / steps.clip(1)).max())
     return row | shape | _errors(series) | _soundness(series)
@@ -75,8 +74,7 @@ def _soundness(series: dict[str, Floats]) -> Row:
         name: float(np.nansum(series[name][1:]))
         for name in ("substeps", "fallbacks", "energy_gained")
     }
-    if series["inverted"][-1] >= 0:
-        row["inverted"] = float(series["inverted"][-1])
+    row["inverted"] = float(series["inverted"][-1])
     if series["self_contacts"].any():
         row["self_contacts"] = float(series["self_contacts"].max())
         row["self_distance"] = float(np.nanmin(series["self_distance"]))

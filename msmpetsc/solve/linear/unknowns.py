@@ -80,14 +80,15 @@ class Unknowns:
 
         Fixed components keep their values.
         """
-        kept = nodes[self.rollers]
+        kept = nodes[self.rollers] if len(self.rollers[0]) else None
         _spread(self.size, self.columns(vector), self.free, nodes)
         if self._ghosted:
             values, owned = self._ghosted.values, self.lattice.owned
             values[:owned] = nodes[:owned]
             self._ghosted.update()
             nodes[owned:] = values[owned:]
-        nodes[self.rollers] = kept
+        if kept is not None:
+            nodes[self.rollers] = kept
 
     def from_nodes(self, nodes: Positions, vector: PETSc.Vec) -> None:
         """Copy the free owned rows of ``nodes`` (>= owned, 3) to a vector of unknowns."""
@@ -96,7 +97,8 @@ class Unknowns:
     def collect(self, nodes: Rows, columns: Rows) -> None:
         """Copy the free owned rows of ``nodes`` (>= owned, 3) to ``columns`` (3, m)."""
         columns[:] = nodes[self.free].T
-        columns.reshape(-1)[self._roller_rows] = 0
+        if len(self._roller_rows):
+            columns.reshape(-1)[self._roller_rows] = 0
 
     def projected(self, rows: Rows) -> Rows:
         """Set the fixed components of rows (k, 3 m) of unknowns to zero; return the same rows."""

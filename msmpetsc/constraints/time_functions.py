@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,6 +37,9 @@ class Lines:
 
     def value_at(self, time: float) -> Floats:
         """Return the vector (c,) at a time [s]."""
+        if len(self.times) == 1:
+            constant: Floats = self.vectors[0].copy()
+            return constant
         return np.array([np.interp(time, self.times, column) for column in self.vectors.T])
 
     def mean(self, begin: float, end: float, start: float, stop: float | None) -> Floats:
@@ -43,18 +47,19 @@ class Lines:
 
         The function counts as 0 before ``start`` [s] and after ``stop`` [s]; None is infinite.
         """
-        kinks = np.array([start, *self.times, np.inf if stop is None else stop])
-        for kink in kinks:
+        inner, stop = self.times.tolist(), np.inf if stop is None else stop
+        for kink in (start, *inner, stop):
             begin, end = (
                 kink if abs(kink - time) <= AT_EVENT * abs(time) else time for time in (begin, end)
             )
-        first, last = max(begin, kinks[0]), min(end, kinks[-1])
+        first, last = max(begin, start), min(end, stop)
         if not first < last:
             return np.zeros(self.vectors.shape[1])
-        times = [first, *self.times[(first < self.times) & (self.times < last)], last]
-        shares = np.diff((np.array(times) - begin) / (end - begin))
-        values = np.array([self.value_at(time) for time in times])
-        mean: Floats = shares @ (0.5 * (values[:-1] + values[1:]))
+        times = [first, *(time for time in inner if first < time < last), last]
+        mean = np.zeros(self.vectors.shape[1])
+        for begun, ended in pairwise(times):
+            share = (ended - begun) / (end - begin)
+            mean += 0.5 * share * (self.value_at(begun) + self.value_at(ended))
         return mean
 
 

@@ -340,9 +340,9 @@ class Bdf2(ImplicitEuler):
         q, v, work_before = state.q, state.velocity(self.time_step), Work()
         begin, forces = time - self.time_step, self.environment.forces
         forces.begin_step(q, v, begin)
-        load = forces.mean(begin, time)
         history, begun_error = state.history, 0.0
         if history is None:
+            load = forces.mean(begin, time)
             history, v, begun_error, work_before = self._history(state, load, time)
         else:
             load = forces.ahead(begin - (state.span or self.time_step), begin, time)

@@ -138,14 +138,30 @@ class EnergyBalance:
         Raises StepFailed if a number is not finite, or if the spurious energy is above
         FAILING_GAIN times the largest legitimate energy.
         """
-        budget = self._budget_after(before, result, after, time, time_step)
+        v = (result.position - result.previous) / time_step
+        self.show(result.position, v, time, after.sides)
+        if not np.isfinite(self.energies.kinetic + self.energies.inner):
+            raise StepFailed(
+                f"left numbers that are not finite, {self._worst(result.position)}", "not finite"
+            )
+        # An equilibrium does not depend on earlier energy.
+        if result.static:
+            return replace(after, budget=before.budget), False
+        sums = self._start(before, result, after, time, time_step)
+        budget = self._budget_after(before, result, after, time, time_step, sums)
         gains = before.history is not None and self._history_gains(
-            before, result, after, time, time_step
+            before, result, after, time, time_step, sums
         )
         return replace(after, budget=budget), gains
 
     def _history_gains(
-        self, before: State, result: StepResult, after: State, time: float, time_step: float
+        self,
+        before: State,
+        result: StepResult,
+        after: State,
+        time: float,
+        time_step: float,
+        resting: Floats,
     ) -> bool:
         """Return whether a solved step gains more than NOTABLE_GAIN of all energy (collective).
 
@@ -153,6 +169,8 @@ class EnergyBalance:
         or the end of the step. In any other frame these obstacles do work. If no obstacle presses,
         the frame moves with the body, so that rigid motion has no effect. The frame rests along
         components that pins or anchors hold, because in a moving frame they do work.
+
+        resting : (5,) [J], as ``_start`` returns them for a frame at rest
         """
         lattice, owned = self.lattice, slice(self.lattice.owned)
         displacement = result.position[owned] - result.previous[owned]
@@ -174,36 +192,37 @@ class EnergyBalance:
         moving = sums[5:8] / (pressing * time_step) if pressing > 0 else momentum / mass
         frame = np.where(is_fixed, 0.0, moving)
         # Impacts follow the solve, so the next step starts with their energy.
-        start, _, work, _, _ = self._start(before, result, after, time, time_step, frame)
+        if frame.any():
+            resting = self._start(before, result, after, time, time_step, frame)
+        start, _, work, _, _ = resting
         ended = self.energies.inner - momentum @ frame + 0.5 * mass * frame @ frame
         gained = ended - start - work
         return bool(gained > NOTABLE_GAIN * max(start + max(work, 0.0), self.floor))
 
     def _budget_after(
-        self, before: State, result: StepResult, after: State, time: float, time_step: float
+        self,
+        before: State,
+        result: StepResult,
+        after: State,
+        time: float,
+        time_step: float,
+        sums: Floats,
     ) -> EnergyBudget:
-        """Return the energy budget after a step (collective). Raises StepFailed."""
-        v = (result.position - result.previous) / time_step
-        self.show(result.position, v, time, after.sides)
+        """Return the energy budget after a step (collective). Raises StepFailed.
+
+        sums : (5,) [J], as ``_start`` returns them
+        """
         solved = ended = self.energies
-        if not np.isfinite(solved.kinetic + solved.inner):
-            raise StepFailed(
-                f"left numbers that are not finite, {self._worst(result.position)}", "not finite"
-            )
-        # An equilibrium does not depend on earlier energy.
-        if result.static:
-            return before.budget
         # Obstacles that reflect nodes change the state after the solve.
         is_changed = after.q is not result.position or after.q_previous is not result.previous
         bounces = self.environment.obstacles.strikes and reduced(self.comm, is_changed, MPI.LOR)
         if bounces:
             ended = self._energies(after.q, after.velocity(time_step), time, after.sides)
-        sums = self._start(before, result, after, time, time_step)
         budget = self._updated(before.budget, solved, ended, sums, bounces)
         if budget.gained > FAILING_GAIN * budget.put_in:
             raise StepFailed(
                 f"gained {budget.gained:.2e} J from nowhere, of {budget.put_in:.2e} J that were "
-                f"there: {self._worst(v)}"
+                f"there: {self._worst(result.position - result.previous)}"
                 f"{describe_inverted(self.comm, self.lattice, result.position)}; "
                 f"try {self.remedy(result.explicit)}",
                 "energy",

@@ -170,10 +170,9 @@ class LowestCurvature:
         if self.mode is None:
             return None
         its = self.effort.followed
-        values, modes = self.search.lowest([self.mode[None]], 1, 0, 0)
-        if abs(values[0] - self.value) <= UNCHANGED * self.value:
+        if abs(self.search.curvature(self.mode) - self.value) <= UNCHANGED * self.value:
             # The stored curvature stays, so that slow changes add up
-            return np.array([self.value]), modes
+            return np.array([self.value]), self.mode[None]
         start = [self.mode[None], self.search.random(1)]
         values, modes = self.search.lowest(start, 2, its, its)
         return None if values[0] > MORE * self.value else (values, modes)

@@ -107,6 +107,12 @@ class Lobpcg:
         self._of_each(self.preconditioner.apply, noise, noise)
         return self.unit(noise)
 
+    def curvature(self, direction: Floats) -> float:
+        """Return the curvature v^T H v along a direction v (n,) of unit length in the norm of M."""
+        product = np.empty_like(direction)
+        self._of_each(self.hessian.mult, direction[None], product[None])
+        return float(reduced(self.comm, float(direction @ product)))
+
     def lowest(
         self,
         start: list[Rows],

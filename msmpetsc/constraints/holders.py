@@ -85,7 +85,8 @@ class Holders:
         torques = np.zeros((len(self.keys), 3))
         for holder, point in enumerate(points):
             taken = np.where(self.number == holder, forces, 0.0)
-            torques[holder] = to_host(np.cross(q - like(q, point), taken).sum(axis=0))
+            moments = to_host((q - like(q, point)).T @ taken)
+            torques[holder] = (moments - moments.T)[[1, 2, 0], [2, 0, 1]]
         return torques
 
 

@@ -77,6 +77,7 @@ class Newton(StepMethod):
             self.ksp.setComputeSingularValues(True)
             self.ksp.setConvergenceTest(self.control.estimate.test)
         self.most_its = self.ksp.getTolerances()[3]
+        self.limits_its = not self.options.is_given("ksp_max_it")
         # V U' of the cells of a softer solid, for the first Hessian of the next solve
         self.slopes: Array | None = None
         # Whether the solve may end after an iteration in which |F| grows by SOFTER,
@@ -194,7 +195,7 @@ class Newton(StepMethod):
         """
         self.adapt(outcome)
         rtol = self.ksp.getTolerances()[0]
-        if not self.options.is_given("ksp_max_it"):
+        if self.limits_its:
             most = self.jacobian.preconditioner.most_iterations(rtol)
             self.ksp.setTolerances(max_it=most or self.most_its)
         self.ksp.setOperators(self.jacobian.operator)

@@ -234,7 +234,7 @@ class Stepper:
                 now, outcome = self.method.minimise(*left)
                 verdict = self.examine(now, outcome)
             self.first_guess.learn(now.q)
-            distance = self.functional.distance(now.q)
+            distance = outcome.distance
             error = self.control.rounding.step_error(verdict.error, distance, outcome.at_rounding)
             cost = replace(self.spent(), step_error=error)
             energy_tolerance = 0.5 * (self.control.target * distance) ** 2 / self.functional.t2
@@ -331,7 +331,7 @@ class Stepper:
         # A budget may end far from the minimum
         if outcome.compression.least_curvature > 0 and not self.budget:
             return Verdict(outcome.error, now, is_minimum=True)
-        enough = control.target * self.functional.distance(now.q) if control.target else np.inf
+        enough = control.target * outcome.distance if control.target else np.inf
         verdict = self.optimality.examine(now, outcome, enough)
         is_good = verdict.error <= control.target or (
             outcome.at_rounding and not np.isinf(verdict.error)

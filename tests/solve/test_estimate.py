@@ -10,6 +10,7 @@ from block_scene import GRAVITY, block_scene, box_at, loop_of, plane_at, solid_o
 from conftest import run
 from lattices import COMM, T, beam, one_spring, weight
 from one_process import assert_one_line
+from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Rows
 from msmpetsc.solve.instrumentation import TrueErrors
@@ -184,6 +185,31 @@ def test_linear_solves_are_as_close_as_the_step_needs():
     rtol = float(PRESETS["newton"].options["ksp_rtol"])
     assert set(loose) == {rtol} and max(tight) == rtol
     assert error_control.CLOSEST * rtol <= min(tight) < 0.1 * rtol
+
+
+def test_the_first_solve_of_a_step_expects_the_reduction_of_the_last_step():
+    """The beam is nearly linear, so its second step begins with a solve to the step error."""
+    lattice, first = beam(), []
+    stepper = Stepper(COMM, lattice, T, find_preset("newton"), error=1e-4)
+
+    def note(ksp: PETSc.KSP, its: int, _: float) -> None:
+        if its == 0:
+            first.append(ksp.getTolerances()[0])
+
+    stepper.ksp.setMonitor(note)
+    q, before = lattice.nodes, lattice.nodes
+    begun = []
+    for _ in range(2):
+        begun.append(len(first))
+        result = stepper.step(StepProblem(q, 2 * q - before, weight(lattice)))
+        q, before = result.position, q
+    stepper.forget()
+    begun.append(len(first))
+    stepper.step(StepProblem(q, 2 * q - before, weight(lattice)))
+    stepper.destroy()
+    rtol = float(PRESETS["newton"].options["ksp_rtol"])
+    expected = [first[at] for at in begun]
+    assert expected[0] == expected[2] == rtol and expected[1] < 0.5 * rtol
 
 
 @pytest.mark.slow

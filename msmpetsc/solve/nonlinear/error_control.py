@@ -12,7 +12,8 @@ The next linear solve reduces its residual by the factor
     rtol = min(ksp_rtol, max((|F_k| / |F_(k-1)|)^2, goal / (2 error), ksp_rtol / 1000))
 
 (Eisenstat and Walker 1996, Choosing the Forcing Terms in an Inexact Newton Method, Choice 2; Kelley
-1995, Iterative Methods for Linear and Nonlinear Equations, Eq. 6.20).
+1995, Iterative Methods for Linear and Nonlinear Equations, Eq. 6.20). A step has no F before its
+first iterate. There the ratio of the last step's first iteration replaces |F_k| / |F_(k-1)|.
 """
 
 from dataclasses import dataclass, replace
@@ -63,7 +64,7 @@ class Outcome:
     bound       : upper bound of the relative error, by |F|_(M^-1)
     residual    : |F|_(M^-1) of the iterate
     distance    : |x - y|_M of the iterate
-    reduction   : residual over the residual of the last iterate
+    reduction   : residual over the residual of the last iterate; expected at the first iterate
     corrected   : whether the error was estimated, so that the Newton correction is known
     alarm       : place where a solve has met a negative curvature
     at_rounding : whether F is rounding alone
@@ -101,6 +102,7 @@ class ErrorControl:
     target : relative error at which a step is done; 0 if a budget of iterations ends the step
     rtol   : ksp_rtol, the loosest tolerance of a linear solve
     ratio  : ratio of bound to error in the last estimate
+    reduction : residual over the residual before, after the last first iteration of a step
     """
 
     functional: StepFunctional
@@ -110,6 +112,7 @@ class ErrorControl:
     target: float
     rtol: float
     ratio: float = FIRST_RATIO
+    reduction: float = 1.0
 
     def judge(self, iterate: Iterate, before: Outcome) -> Outcome:
         """Return the outcome at an iterate, with an upper bound of its error."""
@@ -118,7 +121,7 @@ class ErrorControl:
         stays = residual > STAYS * before.residual
         at_rounding = self.rounding.explains(iterate, stays)
         alarm = min(before.alarm, Alarm.ON_THE_WAY)
-        reduction = residual / before.residual if np.isfinite(before.residual) else 1.0
+        reduction = residual / before.residual if np.isfinite(before.residual) else self.reduction
         now = replace(
             before,
             residual=residual,
@@ -209,7 +212,7 @@ class ErrorControl:
         return replace(now, goal=goal, doubts=now.doubts + 1, bound=np.inf, corrected=False)
 
     def forget(self) -> None:
-        self.ratio = FIRST_RATIO
+        self.ratio, self.reduction = FIRST_RATIO, 1.0
 
 
 def not_converged(

@@ -145,6 +145,8 @@ class Newton(StepMethod):
         snes.monitor(its, now.f.norm())
         if its == 0:
             self.begun = outcome.residual
+        elif its == 1:
+            self.control.reduction = outcome.reduction
         self.overshot = (
             self.ends_on_overshoot and its == 1 and outcome.residual > SOFTER * self.begun
         )

@@ -187,7 +187,7 @@ def test_linear_solves_are_as_close_as_the_step_needs():
     assert error_control.CLOSEST * rtol <= min(tight) < 0.1 * rtol
 
 
-def test_the_first_solve_of_a_step_expects_the_reduction_of_the_last_step():
+def test_the_first_solve_of_a_step_is_as_close_as_the_last_linearisation():
     """The beam is nearly linear, so its second step begins with a solve to the step error."""
     lattice, first = beam(), []
     stepper = Stepper(COMM, lattice, T, find_preset("newton"), error=1e-4)

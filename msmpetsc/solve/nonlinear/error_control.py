@@ -9,11 +9,13 @@ The relative error of x is |x - x*|_M / |x - y|_M. First |x - x*|_M is bounded, 
 
 The next linear solve reduces its residual by the factor
 
-    rtol = min(ksp_rtol, max((|F_k| / |F_(k-1)|)^2, goal / (2 error), ksp_rtol / 1000))
+    rtol = min(ksp_rtol, max(theta, goal / (2 error), ksp_rtol / 1000))
+    theta = (|F_k| / |F_(k-1)|)^2
 
 (Eisenstat and Walker 1996, Choosing the Forcing Terms in an Inexact Newton Method, Choice 2; Kelley
-1995, Iterative Methods for Linear and Nonlinear Equations, Eq. 6.20). A step has no F before its
-first iterate. There the ratio of the last step's first iteration replaces |F_k| / |F_(k-1)|.
+1995, Iterative Methods for Linear and Nonlinear Equations, Eq. 6.20). Theta is the part of F that H
+is expected to miss in the next F. The first solve of a step takes the theta that the first solve of
+the last step had.
 """
 
 from dataclasses import dataclass, replace
@@ -64,7 +66,7 @@ class Outcome:
     bound       : upper bound of the relative error, by |F|_(M^-1)
     residual    : |F|_(M^-1) of the iterate
     distance    : |x - y|_M of the iterate
-    reduction   : residual over the residual of the last iterate; expected at the first iterate
+    missed      : theta, the part of F that H is expected to miss in the next F
     corrected   : whether the error was estimated, so that the Newton correction is known
     alarm       : place where a solve has met a negative curvature
     at_rounding : whether F is rounding alone
@@ -77,7 +79,7 @@ class Outcome:
     bound: float = np.inf
     residual: float = np.inf
     distance: float = 0.0
-    reduction: float = 1.0
+    missed: float = 1.0
     corrected: bool = False
     alarm: Alarm = Alarm.NOWHERE
     at_rounding: bool = False
@@ -102,7 +104,7 @@ class ErrorControl:
     target : relative error at which a step is done; 0 if a budget of iterations ends the step
     rtol   : ksp_rtol, the loosest tolerance of a linear solve
     ratio  : ratio of bound to error in the last estimate
-    reduction : residual over the residual before, after the last first iteration of a step
+    missed : theta of the first iteration of the last step
     """
 
     functional: StepFunctional
@@ -112,7 +114,7 @@ class ErrorControl:
     target: float
     rtol: float
     ratio: float = FIRST_RATIO
-    reduction: float = 1.0
+    missed: float = 1.0
 
     def judge(self, iterate: Iterate, before: Outcome) -> Outcome:
         """Return the outcome at an iterate, with an upper bound of its error."""
@@ -121,12 +123,13 @@ class ErrorControl:
         stays = residual > STAYS * before.residual
         at_rounding = self.rounding.explains(iterate, stays)
         alarm = min(before.alarm, Alarm.ON_THE_WAY)
-        reduction = residual / before.residual if np.isfinite(before.residual) else self.reduction
+        is_first = np.isinf(before.residual)
+        missed = self.missed if is_first else (residual / before.residual) ** 2
         now = replace(
             before,
             residual=residual,
             distance=distance,
-            reduction=reduction,
+            missed=missed,
             corrected=False,
             alarm=alarm,
             at_rounding=at_rounding,
@@ -192,7 +195,7 @@ class ErrorControl:
         """Return the tolerance of the linear solve at an iterate."""
         if not now.goal * now.bound > 0:
             return self.rtol
-        needed = max(now.reduction**2, 0.5 * now.goal * self.ratio / now.bound)
+        needed = max(0.5 * now.goal * self.ratio / now.bound, now.missed)
         return min(max(needed, CLOSEST * self.rtol), self.rtol)
 
     def doubt(self, now: Outcome, has_moved: bool) -> Outcome | None:
@@ -212,7 +215,7 @@ class ErrorControl:
         return replace(now, goal=goal, doubts=now.doubts + 1, bound=np.inf, corrected=False)
 
     def forget(self) -> None:
-        self.ratio, self.reduction = FIRST_RATIO, 1.0
+        self.ratio, self.missed = FIRST_RATIO, 1.0
 
 
 def not_converged(

@@ -131,6 +131,8 @@ class Newton(StepMethod):
             if lower is None:
                 projected = PROJECTED
                 continue
+            if its == 0:
+                self.control.missed = self._missed(lower.f, outcome)
             is_stuck = share < STUCK and self.ksp.reason == KSP.DIVERGED_INDEFINITE_MAT
             projected, its = max(projected - 1, PROJECTED * is_stuck), its + 1
             now, outcome = lower, self._judge(lower, outcome, projected)
@@ -145,8 +147,6 @@ class Newton(StepMethod):
         snes.monitor(its, now.f.norm())
         if its == 0:
             self.begun = outcome.residual
-        elif its == 1:
-            self.control.reduction = outcome.reduction
         self.overshot = (
             self.ends_on_overshoot and its == 1 and outcome.residual > SOFTER * self.begun
         )
@@ -213,7 +213,7 @@ class Newton(StepMethod):
     def _trust(self, now: Iterate, outcome: Outcome) -> float:
         """Return a lower bound of |y|_M over the error; 0 if y does not bound the error.
 
-        Let H miss a part of size theta |F(x)| of F(x - y). Then Newton's corrections shrink by
+        Let H miss theta |F(x)| of F(x - y). Then Newton's corrections shrink by
         about theta, and the error is at most |y|_M / (1 - theta) (Deuflhard 2011, Newton Methods
         for Nonlinear Problems, Sect. 2.1). Contact has kinks that no H predicts. With contact,
         |y|_M counts as the error.
@@ -224,10 +224,23 @@ class Newton(StepMethod):
         x.waxpy(-1.0, self.y, now.x)
         with LOCAL:
             functional.evaluate(x, f)
-        f.axpy(-1.0, self.control.estimate.residual)
-        theta = functional.dual_norm(f) / outcome.residual
+        theta = self._missed(f, outcome)
         functional.vectors.give_back(f)
         return max(1 - theta, 0.0)
+
+    def _missed(self, f: PETSc.Vec, outcome: Outcome) -> float:
+        """Return theta = |f - (F - H y)| / |F|, the part of F at the next iterate that H missed.
+
+        f       : F at the next iterate [kg m]
+        outcome : outcome at the iterate of F
+        """
+        functional, residual = self.functional, self.control.estimate.residual
+        self.ksp.buildResidual(residual)
+        change = functional.vectors.take()
+        change.waxpy(-1.0, residual, f)
+        missed = functional.dual_norm(change) / outcome.residual
+        functional.vectors.give_back(change)
+        return missed
 
     def _search(self, now: Iterate, flat: bool) -> Iterate | None:
         """Return the first iterate x - s y with sufficient descent; None if no s lowers g.

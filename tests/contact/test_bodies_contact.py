@@ -4,11 +4,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import trimesh
 from block_scene import GRAVITY, ROUGH_GROUND, loop_of, model_of, play, solid_of, write_scene
-from conftest import result_on
+from conftest import run
 from crossings import crossings
 
 import msmpetsc.contact.surface.pairs
@@ -304,7 +305,10 @@ def test_on_three_ranks_they_end_as_on_one(folder: Path):
     tight = {"preset": "newton", "error": 1e-9}
     path = fall(folder, "ranks", 0.002, time={"step": 0.01, "duration": 0.04}, solver=tight)
     _, frames = play(path)
-    three = result_on(3, path)
-    assert three["frames/self_contacts"][-1] > 0
+    words = "run", path, "-o", path.with_suffix(".h5")
+    # numpy warns of the mean of no points, which ranks above 0 have
+    assert "Warning" not in run(3, "-m", "msmpetsc.cli.main", *words, status=0).stderr
+    three = h5py.File(path.with_suffix(".h5"))
+    assert (three["frames/self_contacts"][-2:] > 0).all()
     expected, rest = np.array([frame.position for frame in frames]), three["lattice/nodes"][:]
     assert np.abs(three["frames/position"] - expected).max() < 1e-6 * np.abs(expected - rest).max()

@@ -204,7 +204,8 @@ class ContactSearch:
     def narrow(self, pairs: ActivePairs) -> None:
         """Use only candidates around the points of given pairs, unless too many points touch."""
         touched = self.pushes(pairs).any(axis=1)
-        self.is_narrow = self.comm.bcast(bool(pairs.count == 0 or touched.mean() < FEW))
+        few = pairs.count == 0 or touched.sum() < FEW * len(touched)
+        self.is_narrow = self.comm.bcast(bool(few))
         self.is_left_out = self.is_narrow and pairs.count == 0
         if self.is_narrow and not self.is_left_out:
             points = self.points(pairs.q, self.time)

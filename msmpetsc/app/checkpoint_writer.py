@@ -21,9 +21,11 @@ CHECKPOINT_TIME = 0.01
 
 
 class Checkpoints:
-    """Writer of checkpoints and XDMF: at the first and last step, when due, and at a signal.
+    """Writer of checkpoints: at the first and last step, when due, and at a signal.
 
-    every  : frames between checkpoints; None for an interval that takes CHECKPOINT_TIME of the run
+    The XDMF file is written with a checkpoint if this takes at most CHECKPOINT_TIME of the run.
+
+    every  : frames between checkpoints; None for an interval that takes CHECKPOINT_TIME
     signal : number of the signal that ended the run before its last step; 0 if there was none
     """
 
@@ -33,12 +35,11 @@ class Checkpoints:
         self.simulation = simulation
         self.every = every
         self.signal = 0
-        # step of the last checkpoint, frames since it, time at which it was written,
-        # and interval until the next checkpoint [s]
+        # step of the last checkpoint, frames since it, and the time from which another
+        # write takes no more than CHECKPOINT_TIME of the run [s]
         self._written = -1
         self._frames = 0
-        self._ended = perf_counter()
-        self._interval = 0.0
+        self._due = 0.0
 
     def steps(self) -> Iterator[Frame | None]:
         """Yield the frame or None after each step, until a signal ends a step (collective)."""
@@ -54,10 +55,11 @@ class Checkpoints:
         """
         simulation = self.simulation
         self._frames += is_stored
-        due = perf_counter() - self._ended >= self._interval
+        due: bool = self.comm.bcast(perf_counter() >= self._due)
+        with_xdmf = due
         if self.every is not None:
             due = self._frames >= self.every
-        due = self.comm.bcast(due) or simulation.step in (0, simulation.steps)
+        due = due or simulation.step in (0, simulation.steps)
         number = Stop.agreed(self.comm)
         if due or number:
             began = perf_counter()
@@ -67,10 +69,12 @@ class Checkpoints:
                 self._written = saved.step
             if simulation.step == simulation.steps != saved.step:
                 self.file.write_checkpoint(simulation.end)
-            on_root(self.comm, lambda: write_xdmf(self.file.path))
             self._frames = 0
-            self._ended = perf_counter()
-            self._interval = (self._ended - began) / CHECKPOINT_TIME
+            # the XDMF file is written whole, so its time grows with the frames
+            if with_xdmf:
+                on_root(self.comm, lambda: write_xdmf(self.file.path))
+                ended = perf_counter()
+                self._due = ended + (ended - began) / CHECKPOINT_TIME
         # a signal after the last step stops nothing
         if simulation.step < simulation.steps:
             self.signal = number

@@ -15,7 +15,7 @@ from one_process import errors, input_error
 from stopped_runs import signal_after
 
 import msmpetsc
-from msmpetsc.app import abort
+from msmpetsc.app import abort, checkpoint_writer
 from msmpetsc.app.request import OPTIONS, RunRequest
 from msmpetsc.cli.main import main, parsed
 from msmpetsc.errors import InputError
@@ -49,6 +49,17 @@ def test_it_writes_what_the_command_writes(scene: Path, tmp_path: Path, capsys):
         assert command.startswith(
             f"msmpetsc run {scene} --output={path} --preset=newton --frames=2 --set="
         )
+
+
+def test_the_xdmf_file_takes_little_time_even_with_a_checkpoint_at_each_frame(
+    scene: Path, tmp_path: Path, monkeypatch
+):
+    """The file is written whole, so that writing it with each frame took ten times the run."""
+    written: list[Path] = []
+    monkeypatch.setattr(checkpoint_writer, "write_xdmf", written.append)
+    time = {"time.step": 1e-3, "time.duration": 0.1}
+    msmpetsc.run(scene, tmp_path / "x.h5", set=time, checkpoint_every=1, quiet=True)
+    assert 1 <= len(written) < 50
 
 
 def test_petsc_options_are_those_of_one_run(scene: Path, tmp_path: Path):

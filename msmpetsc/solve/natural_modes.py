@@ -104,10 +104,8 @@ def _about(
             )
         stepper.set_up()
         functional.begin(replace(problem, q=q, y=q))
-        contact = functional.place(q).contact
         with petsc_errors("PETSc cannot find modes", stepper):
-            stepper.jacobian.hessian.linearise(q, contact)
-            stepper.jacobian.preconditioner.prepare(q, contact)
+            stepper.jacobian.linearise(functional.place(q), False, None)
             squares, modes = _lowest(stepper.optimality.curvature.search, count)
         order = np.lexsort((squares, squares != 0))
         shapes = np.zeros((count, lattice.owned, 3))

@@ -170,7 +170,7 @@ class EnergyBalance:
         the frame moves with the body, so that rigid motion has no effect. The frame rests along
         components that pins or anchors hold, because in a moving frame they do work.
 
-        resting : (5,) [J], as ``_start`` returns them for a frame at rest
+        resting : (5,) terms [J] of ``_start`` in a frame at rest
         """
         lattice, owned = self.lattice, slice(self.lattice.owned)
         displacement = result.position[owned] - result.previous[owned]
@@ -192,9 +192,9 @@ class EnergyBalance:
         moving = sums[5:8] / (pressing * time_step) if pressing > 0 else momentum / mass
         frame = np.where(is_fixed, 0.0, moving)
         # Impacts follow the solve, so the next step starts with their energy.
-        if frame.any():
-            resting = self._start(before, result, after, time, time_step, frame)
-        start, _, work, _, _ = resting
+        is_moving = frame.any()
+        terms = self._start(before, result, after, time, time_step, frame) if is_moving else resting
+        start, _, work, _, _ = terms
         ended = self.energies.inner - momentum @ frame + 0.5 * mass * frame @ frame
         gained = ended - start - work
         return bool(gained > NOTABLE_GAIN * max(start + max(work, 0.0), self.floor))

@@ -84,6 +84,8 @@ class Environment:
     ) -> StepContact | None:
         """Return the contact of a step from q, with friction; None without contact (collective).
 
+        ``begin_contacts`` has begun the step.
+
         last : positions (l, 3) [m] one step before q, for a two-step method
         end  : contact at the end of an earlier solve of this step, whose normal forces then limit
             friction
@@ -93,7 +95,8 @@ class Environment:
         ended = end.q if end else None
         states = self.obstacles.during(q, last, ended, (time, time_step), sides, previous)
         if self.contacts and not self.contacts.is_left_out:
-            start = self.contacts.of_step(q, max(time - time_step, 0.0))
+            start = self.contacts.start
+            assert start is not None
             pairs = end.surface.pairs if end and end.surface else None
             before = previous.surface if previous else None
             surface = SurfaceContact(self.contacts, start, time_step, last, pairs, before)
@@ -112,23 +115,24 @@ class Environment:
         ended = self._ended
         if ended is None or not reduced(self.lattice.table.comm, q is ended.q, MPI.LAND):
             return None
-        return ended.contact
+        return ended.step
 
     def settle_contacts(
         self, contact: StepContactAt | None, x: Positions, tolerance: float
     ) -> tuple[StepContactAt | None, bool, bool]:
-        """Return the contact at a solution with all pairs of the surface, and whether it is right.
+        """Return the contact at a solution with all pairs, and whether the solution is right.
 
-        Also return whether the surface crosses nothing on the path to the solution (collective).
+        Also return whether the surface crosses nothing on the path to the solution (collective). If
+        the step left the surface out, the contact has no surface.
 
         contact   : contact at the solution x (l, 3) [m], with the pairs used
-        tolerance : as in ContactSearch.end_step [J]
+        tolerance : as in ContactSearch.settle [J]
         """
         if not self.contacts:
             return contact, True, True
         surface = contact.surface if contact else None
         used = surface.pairs if surface else None
-        is_free, is_right = self.contacts.end_step(used, x, tolerance)
+        is_right, is_free = self.contacts.settle(used, x, tolerance)
         if contact and surface and self.contacts.end:
             contact = replace(contact, surface=replace(surface, pairs=self.contacts.end))
         return contact, is_right, is_free
@@ -168,4 +172,4 @@ class Environment:
         """
         if not self.contacts:
             return ContactSummary()
-        return self.contacts.summary(self.contacts.of_step(q, time))
+        return self.contacts.summary(self.contacts.pairs_at(q, time))

@@ -72,12 +72,15 @@ class StepContact:
 class StepContactAt:
     """The contact energy of a step at given positions, with its derivatives.
 
+    Methods that use the surface are collective.
+
+    step    : contact in the step
     q       : (owned or more, 3) positions [m]
     pressed : the nodes inside each obstacle
     surface : contact of surfaces; None without it
     """
 
-    contact: StepContact
+    step: StepContact
     q: Positions
     pressed: list[Pressed]
     surface: SurfaceContactAt | None
@@ -85,7 +88,7 @@ class StepContactAt:
     @property
     def of_obstacles(self) -> Iterator[tuple[ObstacleContact, Pressed]]:
         """The contact of each obstacle, with the nodes inside."""
-        return zip(self.contact.states, self.pressed, strict=True)
+        return zip(self.step.states, self.pressed, strict=True)
 
     @property
     def presses_nodes(self) -> bool:
@@ -97,8 +100,8 @@ class StepContactAt:
 
     def change(self, base: "StepContactAt") -> float:
         """Return the change [J] of the contact energy from base to here, friction included."""
-        owned, total = self.contact.owned, 0.0
-        for state in self.contact.states:
+        owned, total = self.step.owned, 0.0
+        for state in self.step.states:
             total += state.change(self.q[:owned], base.q[:owned])
             if state.friction:
                 total += state.friction.change(self.q, base.q)
@@ -108,16 +111,16 @@ class StepContactAt:
 
     def friction_limits(self) -> Floats:
         """Return this rank's sums of mu N [N], (2,): as the step's friction uses it, and here."""
-        owned = self.contact.owned
+        owned = self.step.owned
         of_nodes = sum(
-            (state.friction_limits(self.q[:owned]) for state in self.contact.states), np.zeros(2)
+            (state.friction_limits(self.q[:owned]) for state in self.step.states), np.zeros(2)
         )
         return of_nodes + self.surface.friction_limits() if self.surface else of_nodes
 
     def released(self) -> float:
         """Return the energy [J] of elastic slips at the step's beginning minus that here."""
         of_nodes = sum(
-            state.friction.released(self.q) for state in self.contact.states if state.friction
+            state.friction.released(self.q) for state in self.step.states if state.friction
         )
         return of_nodes + (self.surface.released() if self.surface else 0.0)
 
@@ -125,7 +128,7 @@ class StepContactAt:
         """Return the duals of friction after the full step from base to here."""
         of_nodes = [
             state.friction.duals_after(self.q, base.q, known) if state.friction else None
-            for state, known in zip(self.contact.states, duals[:-1], strict=True)
+            for state, known in zip(self.step.states, duals[:-1], strict=True)
         ]
         of_surface = None
         if self.surface and base.surface:
@@ -135,7 +138,7 @@ class StepContactAt:
     def add_gradient(self, gradient: Rows) -> None:
         """Add the gradient [N] of the contact energy to ``gradient`` (owned or more, 3)."""
         for state, pressed in self.of_obstacles:
-            state.add_gradient(self.q[: self.contact.owned], pressed, gradient)
+            state.add_gradient(self.q[: self.step.owned], pressed, gradient)
         if self.surface:
             self.surface.add_gradient(gradient)
 
@@ -146,7 +149,7 @@ class StepContactAt:
 
         end : (owned or more, 3) [m]
         """
-        owned, stopped = self.contact.owned, None
+        owned, stopped = self.step.owned, None
         for state, (inside, _, _) in self.of_obstacles:
             rows, depth, normal = state.pressed(end[:owned])
             was_inside = np.zeros(owned, bool, like=end)
@@ -177,7 +180,7 @@ class StepContactAt:
 
         The obstacles' part changes only with the set of nodes in contact, the surface's seldom.
         """
-        bound = np.zeros(self.contact.owned, like=self.q)
+        bound = np.zeros(self.step.owned, like=self.q)
         for state, (rows, _, _) in self.of_obstacles:
             bound[rows] += state.penalty.stiffness
             if state.friction:

@@ -232,10 +232,10 @@ def test_what_stores_too_little_to_count_may_be_left_out(folder: Path, monkeypat
     for left_out, is_right in ((1.01, True), (0.99, False)):
         contacts.narrow(begun)
         assert contacts.is_left_out
-        assert contacts.end_step(None, end, left_out * energy / LEFT_OUT) == (True, is_right)
+        assert contacts.settle(None, end, left_out * energy / LEFT_OUT) == (is_right, True)
         assert not (contacts.is_narrow or contacts.is_left_out)
     assert contacts.summary(contacts.end).energy == pytest.approx(energy)
-    assert contacts.end_step(contacts.end, end, 0.0) == (True, True)
+    assert contacts.settle(contacts.end, end, 0.0) == (True, True)
 
 
 def test_a_step_past_what_it_would_meet_is_solved_with_the_surface(

@@ -123,7 +123,8 @@ class ContactSearch:
 
     barrier     : on rank 0
     edge        : mean length of the bodies' edges at rest [m]
-    start, end  : pairs at the start and at the end of the last step; ``end`` is None before its end
+    start       : pairs at the start of the last step; None before the first step
+    end         : pairs at the end of the last step, or of its last solve; None before that solve
     is_narrow   : whether only candidates around known contacts are used
     is_left_out : whether the step is narrow without contacts, so that the surface is left out
     """
@@ -150,10 +151,10 @@ class ContactSearch:
         """Begin a step from q between two times [s], with all candidates. Return the pairs at q."""
         self.begin, self.time = begin, time
         self.widen()
-        self.start, self.end = self.of_step(q, begin), None
+        self.start, self.end = self.pairs_at(q, begin), None
         return self.start
 
-    def of_step(self, q: Positions, time: float) -> ActivePairs:
+    def pairs_at(self, q: Positions, time: float) -> ActivePairs:
         """Return the pairs at q and a time [s], known if the last step began or ended there."""
         for known in (self.end, self.start):
             is_known = known is not None and known.q is q and self.same(known.time, time)
@@ -216,15 +217,13 @@ class ContactSearch:
         """Use all candidates from now on."""
         self.is_narrow = self.is_left_out = False
 
-    def end_step(
-        self, used: ActivePairs | None, x: Positions, tolerance: float
-    ) -> tuple[bool, bool]:
-        """Return whether the path to the solution x is free, and whether x is right (collective).
+    def settle(self, used: ActivePairs | None, x: Positions, tolerance: float) -> tuple[bool, bool]:
+        """Return whether a solution x is right, and whether the path to x is free.
 
         A solution of a narrow step is right if the path is free, and if all pairs have nearly the
         energy of the pairs used. Afterwards the step uses all candidates.
 
-        used      : pairs of the step at x; None if the surface was left out
+        used      : pairs at x with which x was found; None if the surface was left out
         tolerance : energy [J]; if g / tau^2 is this close to its minimum, x meets the error
         """
         if not self.is_narrow:
@@ -236,7 +235,7 @@ class ContactSearch:
         free = self.collision_free_step(self.start.q, x, self.begin) == 1.0
         self.end = self.find(x)
         missing = abs(self.summary(self.end).energy - energy)
-        return free, free and missing <= SAME_ENERGY * energy + LEFT_OUT * tolerance
+        return free and missing <= SAME_ENERGY * energy + LEFT_OUT * tolerance, free
 
     def same(self, begin: float, end: float) -> bool:
         """Return whether obstacles have the same places at two times [s]."""
@@ -253,10 +252,8 @@ class ContactSearch:
         """Return number, least distance and energy of the pairs."""
         summary = ContactSummary()
         if self.barrier and pairs.count:
-            least = self.barrier.least(pairs.sets, pairs.points)
-            summary = ContactSummary(
-                pairs.count, least, self.barrier.energy(pairs.sets, pairs.points)
-            )
+            at = pairs.sets, pairs.points
+            summary = ContactSummary(pairs.count, self.barrier.least(*at), self.barrier.energy(*at))
         of_all: ContactSummary = self.comm.bcast(summary)
         return of_all
 

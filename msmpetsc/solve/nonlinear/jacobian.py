@@ -133,7 +133,7 @@ class Jacobian:
         if self.preset.true_hessian:
             self.hessian.linearise(q, contact, projected, duals)
         elif self.blocks:
-            self.blocks.linearise(contact, contact.contact.no_duals() if contact else None)
+            self.blocks.linearise(contact, contact.step.no_duals() if contact else None)
         changed = self.preconditioner.prepare(q, contact)
         if self.preset.true_hessian or changed:
             self.operator.assemble()

@@ -272,7 +272,7 @@ class LatticePreconditioner(StepPreconditioner):
         """
         lattice = self.unknowns.lattice
         blocks = np.zeros((lattice.owned if contact else 0, 9), like=lattice.nodes)
-        for nodes, added in contact.hessian(contact.contact.no_duals()) if contact else ():
+        for nodes, added in contact.hessian(contact.step.no_duals()) if contact else ():
             blocks[nodes] += added.reshape(-1, 9)
         return blocks
 

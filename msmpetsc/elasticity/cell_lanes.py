@@ -35,9 +35,9 @@ AT_STATE = CONSTANTS + ROWS * LANES
 RESULT = AT_STATE + STATE * LANES
 WORK = RESULT + 24 * LANES
 
-# numba's options of loops over lanes. Vectorisation needs sums that may be reordered.
-# Inlined, a loop is optimised in its caller alone. Otherwise a run that compiles would
-# use another order than later runs.
+# numba's options for loops over lanes. Vectorisation needs sums that may be reordered.
+# LLVM optimises an inlined loop in its caller alone. Without inlining, a run that
+# compiles would sum in another order than later runs.
 LANE_LOOP: Any = {
     "fastmath": {"contract", "nsz", "reassoc", "arcp"},
     "error_model": "numpy",

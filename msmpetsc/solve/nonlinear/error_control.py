@@ -14,8 +14,8 @@ The next linear solve reduces its residual by the factor
 
 (Eisenstat and Walker 1996, Choosing the Forcing Terms in an Inexact Newton Method, Choice 2; Kelley
 1995, Iterative Methods for Linear and Nonlinear Equations, Eq. 6.20). Theta is the part of F that H
-is expected to miss in the next F. The first solve of a step takes the theta that the first solve of
-the last step had.
+is expected to miss in the next F. The first solve of a step takes theta as measured at the last
+first iteration after which a step went on.
 """
 
 from dataclasses import dataclass, replace
@@ -104,7 +104,7 @@ class ErrorControl:
     target : relative error at which a step is done; 0 if a budget of iterations ends the step
     rtol   : ksp_rtol, the loosest tolerance of a linear solve
     ratio  : ratio of bound to error in the last estimate
-    missed : theta of the first iteration of the last step
+    missed : theta of the last first iteration after which a step went on; 1 before it
     """
 
     functional: StepFunctional

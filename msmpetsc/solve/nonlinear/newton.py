@@ -77,6 +77,7 @@ class Newton(StepMethod):
             self.ksp.setComputeSingularValues(True)
             self.ksp.setConvergenceTest(self.control.estimate.test)
         self.most_its = self.ksp.getTolerances()[3]
+        # Whether an old preconditioner limits the iterations of a linear solve
         self.limits_its = not self.options.is_given("ksp_max_it")
         # V U' of the cells of a softer solid, for the first Hessian of the next solve
         self.slopes: Array | None = None

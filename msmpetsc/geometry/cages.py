@@ -16,7 +16,7 @@ from msmpetsc.comm import Route, log, on_root
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.cell_parts import CellParts, parts_of
 from msmpetsc.geometry.copies import NO_COPIES, Copies, find_copies
-from msmpetsc.geometry.fill_fractions import Columns, sampled_inside
+from msmpetsc.geometry.fill_fractions import LEAK, Columns, sampled_inside
 from msmpetsc.geometry.grid import CHUNK, CORNERS, BodyGrids, Grid, packed, unpacked
 from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
 from msmpetsc.geometry.partition import SortedKeys, places_of, ranges
@@ -304,13 +304,14 @@ def _slab_cells(body: BodySurface, grid: Grid) -> SlabCells:
     limits = np.array([edges[rank], 0, 0]), np.array([edges[rank + 1], *shape[1:]])
     corners = _slab_triangles(body, grid, axes, edges)
     touched = marked_cells(corners, *limits)
-    if body.report.is_balanced:
+    if body.report.closed:
         outwards = corners if body.report.volume > 0 else corners[:, ::-1]
         columns = Columns.crossed(outwards, *limits)
-        gaps = gaps_between(touched)
-        # winding numbers are 1 inside and 0 outside
-        is_inside_body = columns.inside(gaps[:, [0, 1, 3]])[0][:, 0, 0, 0] > 0.5
-        return SlabCells(touched, gaps[is_inside_body], columns)
+        if body.comm.allreduce(columns.leak, MPI.MAX) < LEAK:
+            gaps = gaps_between(touched)
+            # winding numbers are 1 inside and 0 outside
+            is_inside_body = columns.inside(gaps[:, [0, 1, 3]])[0][:, 0, 0, 0] > 0.5
+            return SlabCells(touched, gaps[is_inside_body], columns)
     return SlabCells(touched, _gaps_by_winding(body, grid, axes, edges, touched), None)
 
 

@@ -33,6 +33,10 @@ from msmpetsc.geometry.valid_cells import clip_between, extent, grown
 
 # samples along an axis of a cut cell [-]; the fill beside a plane errs by 0.6% rms
 SAMPLES = 6
+# least winding number below a column that shows inconsistent winding [-]; far above
+# rounding, far below the effect of a single triangle
+LEAK = 1e-6
+
 # number of a piece's sums that also count for the cells below, and of all its sums [-]
 SEEN, SUMS = 6, 17
 
@@ -80,6 +84,12 @@ class Columns:
         moments[:, :2] += above[:, 4:]
         moments[:, 2] += above[:, :4].sum(axis=1) / 12
         return cls(keys, np.reshape(corners, (-1, 2, 2, 2)), moments, below)
+
+    @property
+    def leak(self) -> float:
+        """Largest winding number below a column: 0 for a closed, consistently wound surface."""
+        lowest = np.diff(self.keys // LIMIT, prepend=-1) != 0
+        return float(np.abs(self.below[lowest]).max(initial=0.0))
 
     def inside(self, cells: Indices) -> tuple[Rows, Rows]:
         """Return the fills (k, 2, 2, 2) and second moments (k, 3) of any cells (k, 3)."""

@@ -81,8 +81,6 @@ class SurfaceReport:
     area   : [m^2]
     nonmanifold_edges  : edges of more than two triangles
     inconsistent_edges : edges along which two triangles run in the same direction
-    is_balanced        : whether as many triangles run along each edge in one direction as in the
-                         other, so that winding numbers are whole
     """
 
     volume: float
@@ -90,7 +88,6 @@ class SurfaceReport:
     boundary_edges: int
     nonmanifold_edges: int
     inconsistent_edges: int
-    is_balanced: bool
 
     @property
     def closed(self) -> bool:
@@ -112,7 +109,6 @@ def examine(surface: Surface) -> SurfaceReport:
         boundary_edges=int((used == 1).sum()),
         nonmanifold_edges=int((used > 2).sum()),
         inconsistent_edges=int(((used == 2) & (forward != 1)).sum()),
-        is_balanced=bool((2 * forward == used).all()),
     )
 
 

@@ -44,7 +44,7 @@ def test_fills_have_the_bodys_volume_and_its_centre(name: str, offset: float):
     mesh, h = BODIES[name], 0.17
     columns, cells, origin = columns_of(mesh, h, offset)
     fills, _ = columns.inside(cells)
-    assert fills.min() > -1e-12 and fills.max() < 1 + 1e-12
+    assert fills.min() > -1e-12 and fills.max() < 1 + 1e-12 and columns.leak < 1e-12
     assert fills.mean(axis=(1, 2, 3)).sum() * h**3 == pytest.approx(mesh.volume, rel=1e-13)
     corners = cells[:, None] + np.indices((2, 2, 2)).reshape(3, 8).T
     centre = np.einsum("cv,cvx->x", fills.reshape(-1, 8), corners) * h**4 / 8 / mesh.volume + origin

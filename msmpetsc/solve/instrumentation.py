@@ -109,7 +109,9 @@ def _distances(reference: Stepper, x: Positions, exact: Positions) -> Floats:
     reference.unknowns.from_nodes(x - exact, vector)
     distance = functional.norm(vector)
     functional.vectors.give_back(vector)
-    return np.array([distance, functional.change(functional.at(x), functional.place(exact))[0]])
+    return np.array(
+        [distance, functional.change(functional.at(x), functional.configuration(exact))[0]]
+    )
 
 
 def event_times() -> dict[str, float]:

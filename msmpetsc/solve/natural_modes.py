@@ -105,7 +105,7 @@ def _about(
         stepper.set_up()
         functional.begin(replace(problem, q=q, y=q))
         with petsc_errors("PETSc cannot find modes", stepper):
-            stepper.jacobian.linearise(functional.place(q), False, None)
+            stepper.jacobian.linearise(functional.configuration(q), False, None)
             squares, modes = _lowest(stepper.optimality.curvature.search, count)
         order = np.lexsort((squares, squares != 0))
         shapes = np.zeros((count, lattice.owned, 3))

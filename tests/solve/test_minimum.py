@@ -21,7 +21,7 @@ from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.fields import Frame
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.solve.nonlinear.curvature import ALIKE, Alarm
-from msmpetsc.solve.nonlinear.functional import Place, StepProblem
+from msmpetsc.solve.nonlinear.functional import Configuration, StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper
 from msmpetsc.solve.presets import find_preset
 
@@ -116,7 +116,7 @@ def test_the_lowest_curvature_is_that_of_a_dense_matrix(
     stepper.jacobian.hessian.linearise(q, None)
     stepper.jacobian.preconditioner.prepare(q, None)
     found, direction = curvature.lowest(
-        q, curvature.compression(Place(q, None)), Alarm.NOWHERE, None
+        q, curvature.compression(Configuration(q, None)), Alarm.NOWHERE, None
     )
     assert stepper.jacobian.preconditioner.is_uniform == multigrid
     dense, root = dense_hessian(stepper), np.sqrt(functional.mass)
@@ -128,7 +128,7 @@ def test_the_lowest_curvature_is_that_of_a_dense_matrix(
     if lowest > 0:
         assert found < lowest + 0.1
     # 0 if no curvature was computed
-    known = curvature.compression(Place(q, None)).least_curvature
+    known = curvature.compression(Configuration(q, None)).least_curvature
     assert known == 0 or lowest >= known - 1e-9
     simulation.destroy()
 
@@ -157,7 +157,7 @@ def test_a_compressed_body_that_nothing_moves_is_at_rest(preset: str, shift: flo
     lattice = chain(T**2 * k * (r - 1) / 0.29, k, r)
     stepper = Stepper(MPI.COMM_SELF, lattice, T, find_preset(preset), error=1e-3)
     q = lattice.nodes + shift
-    compression = stepper.optimality.curvature.compression(Place(q, None))
+    compression = stepper.optimality.curvature.compression(Configuration(q, None))
     assert compression.least_curvature == 0 and compression.greatest == pytest.approx(4 * 0.29)
     result = stepper.step(StepProblem(q, q, np.zeros((len(q), 3))))
     stepper.destroy()

@@ -32,7 +32,7 @@ from msmpetsc.solve.integrators.integrator import State
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.free_bodies import bodies_of
 from msmpetsc.solve.nonlinear.curvature import NONE, Alarm
-from msmpetsc.solve.nonlinear.functional import Place, StepProblem
+from msmpetsc.solve.nonlinear.functional import Configuration, StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 from msmpetsc.solve.petsc.library import petsc_errors
 from msmpetsc.solve.recovery import Halving
@@ -149,7 +149,7 @@ class Static(ImplicitEuler):
         self.stepper.set_up()
         optimality, rest = self.stepper.optimality, self.stepper.lattice.nodes
         with petsc_errors("PETSc cannot set up the solver", self.stepper):
-            optimality.estimate.linearise(Place(rest, None))
+            optimality.estimate.linearise(Configuration(rest, None))
             lowest, _ = optimality.curvature.lowest(rest, NONE, Alarm.NOWHERE, None)
         if lowest > 0 and not ACCEPTED_LOWEST[0] <= lowest <= ACCEPTED_LOWEST[1]:
             self.tau *= float(np.sqrt(LOWEST / lowest))

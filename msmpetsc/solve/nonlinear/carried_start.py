@@ -139,7 +139,7 @@ class CarriedStart:
         if Stop.agreed(functional.comm):
             raise StepStopped("stopped by a signal")
         unknowns.from_nodes(q, x)
-        now = functional.evaluate(x, f, functional.place(q))
+        now = functional.evaluate(x, f, functional.configuration(q))
         assert now.contact is not None and now.contact.surface is not None
         self.jacobian.linearise(now, True, contact.no_duals())
         forces = self.jacobian.hessian.forces(fixed)

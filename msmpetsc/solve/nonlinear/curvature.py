@@ -18,7 +18,7 @@ from msmpetsc.backend.arrays import Floats, Positions, Rows, greatest, like, to_
 from msmpetsc.checkpoint import ANY, Checkpoint, Range
 from msmpetsc.comm import reduced
 from msmpetsc.solve.linear.operators import TrueHessian
-from msmpetsc.solve.nonlinear.functional import Place, StepFunctional
+from msmpetsc.solve.nonlinear.functional import Configuration, StepFunctional
 from msmpetsc.solve.nonlinear.lobpcg import (
     DEPENDENT,
     EFFORT,
@@ -105,13 +105,13 @@ class LowestCurvature:
         """Effort of searches with the present preconditioner."""
         return UNIFORM_EFFORT if self.preconditioner.is_uniform else EFFORT
 
-    def compression(self, place: Place) -> Compression:
-        """Return the compression at a place."""
+    def compression(self, configuration: Configuration) -> Compression:
+        """Return the compression of a configuration."""
         functional, free = self.functional, self.unknowns.free
         elasticity = functional.elasticity
-        concavity = elasticity.concavity(place.q)[free]
-        if place.contact and place.contact.surface:
-            concavity = concavity + place.contact.surface.concavity()[free]
+        concavity = elasticity.concavity(configuration.q)[free]
+        if configuration.contact and configuration.contact.surface:
+            concavity = concavity + configuration.contact.surface.concavity()[free]
         ratios = functional.t2 * concavity / functional.lattice.mass[free]
         most, sums = zip(*self.comm.allgather((greatest(ratios), float(ratios.sum()))), strict=True)
         return Compression(max(most), sum(sums), not self.unknowns.static)

@@ -26,7 +26,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from msmpetsc.solve.linear.operators import TrueHessian, python_matrix
-from msmpetsc.solve.nonlinear.functional import Iterate, Place, StepFunctional
+from msmpetsc.solve.nonlinear.functional import Configuration, Iterate, StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 from msmpetsc.solve.petsc.events import ESTIMATE
 
@@ -88,10 +88,10 @@ class ErrorEstimate:
         self.products += self.hessian.products + self.preconditioner.products - before
         return self.correction_norm + self.missing if self.ksp.reason > 0 else np.inf
 
-    def linearise(self, place: Place) -> None:
-        """Linearise the Hessian and the preconditioner at a place."""
-        self.preconditioner.prepare(place.q, place.contact)
-        self.hessian.linearise(place.q, place.contact)
+    def linearise(self, configuration: Configuration) -> None:
+        """Linearise the Hessian and the preconditioner at a configuration."""
+        self.preconditioner.prepare(configuration.q, configuration.contact)
+        self.hessian.linearise(configuration.q, configuration.contact)
         self.operator.assemble()
 
     def begin_step(self, has_contact: bool) -> None:

@@ -71,7 +71,7 @@ class StepProblem:
 
 
 @dataclass(frozen=True)
-class Place:
+class Configuration:
     """Positions in a step, with the contact there.
 
     q       : positions (l, 3) [m], ghosts included
@@ -83,8 +83,8 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Iterate(Place):
-    """Iterate of a step: a place with its unknowns and residual.
+class Iterate(Configuration):
+    """Iterate of a step: a configuration with its unknowns and residual.
 
     x : unknowns; no method writes to them
     f : F [kg m]
@@ -130,30 +130,32 @@ class StepFunctional:
         self.unknowns.to_nodes(x, q)
         return q
 
-    def place(self, q: Positions) -> Place:
-        """Return the place of positions q (l, 3) [m]."""
+    def configuration(self, q: Positions) -> Configuration:
+        """Return the configuration of positions q (l, 3) [m]."""
         if not self.problem.contact:
-            return Place(q, None)
+            return Configuration(q, None)
         with CONTACT:
-            return Place(q, self.problem.contact.at(q))
+            return Configuration(q, self.problem.contact.at(q))
 
-    def evaluate(self, x: PETSc.Vec, f: PETSc.Vec, place: Place | None = None) -> Iterate:
+    def evaluate(
+        self, x: PETSc.Vec, f: PETSc.Vec, configuration: Configuration | None = None
+    ) -> Iterate:
         """Return the iterate of x and write its F into f [kg m].
 
-        place : place of x if it is known
+        configuration : configuration of x if it is known
         """
         problem, gradient, owned = self.problem, self.scratch, self.lattice.owned
         with GRADIENT:
-            place = place or self.place(self.positions(x))
-            q = place.q
+            configuration = configuration or self.configuration(self.positions(x))
+            q = configuration.q
             gradient[:] = 0
             self.elasticity.add_gradient(q, gradient)
             gradient[:owned] -= problem.load
-            if place.contact:
+            if configuration.contact:
                 with CONTACT:
-                    place.contact.add_gradient(gradient)
+                    configuration.contact.add_gradient(gradient)
             self.unknowns.scaled_sum(q[:owned] - problem.y[:owned], self.t2, gradient, f)
-        return Iterate(q, place.contact, x, f)
+        return Iterate(q, configuration.contact, x, f)
 
     def at(self, q: Positions) -> Iterate:
         """Return the iterate whose free nodes are at q (l, 3) [m]."""
@@ -161,12 +163,12 @@ class StepFunctional:
         self.unknowns.from_nodes(q, x)
         return self.iterate(x)
 
-    def iterate(self, x: PETSc.Vec, place: Place | None = None) -> Iterate:
+    def iterate(self, x: PETSc.Vec, configuration: Configuration | None = None) -> Iterate:
         """Return the iterate of x, a vector of the pool that the iterate keeps.
 
-        place : place of x if it is known
+        configuration : configuration of x if it is known
         """
-        iterate = self.evaluate(x, self.vectors.take(), place)
+        iterate = self.evaluate(x, self.vectors.take(), configuration)
         self.vectors.lend(iterate, iterate.x, iterate.f)
         return iterate
 
@@ -185,21 +187,21 @@ class StepFunctional:
         inertia = 0.5 * self._inner(moved, moved)
         return float(reduced(self.comm, inertia + self.t2 * acting))
 
-    def change(self, place: Place, base: Place) -> tuple[float, float]:
-        """Return the change of g [kg m^2] from a base to a place, and |q - q_base|^2 [m^2].
+    def change(self, configuration: Configuration, base: Configuration) -> tuple[float, float]:
+        """Return the change of g [kg m^2] from a base to a configuration, and |q - q_base|^2 [m^2].
 
         Differences are summed term by term, so that a small change keeps its digits.
         """
         problem, owned = self.problem, slice(self.lattice.owned)
-        q, before = place.q, base.q
+        q, before = configuration.q, base.q
         with ENERGY:
             moved = q[owned] - before[owned]
             twice = q[owned] + before[owned] - 2 * problem.y[owned]
             inertia = 0.5 * self._inner(moved, twice)
             elastic = self.elasticity.change(q, before) - float(np.vdot(moved, problem.load))
-            if place.contact and base.contact:
+            if configuration.contact and base.contact:
                 with CONTACT:
-                    elastic += place.contact.change(base.contact)
+                    elastic += configuration.contact.change(base.contact)
             change, squared = reduced(
                 self.comm, [inertia + self.t2 * elastic, float(np.vdot(moved, moved))]
             )

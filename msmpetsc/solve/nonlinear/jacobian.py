@@ -19,7 +19,7 @@ from msmpetsc.solve.linear.operators import (
     assemble,
     python_matrix,
 )
-from msmpetsc.solve.nonlinear.functional import Place, StepFunctional
+from msmpetsc.solve.nonlinear.functional import Configuration, StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import (
     MASSLESS,
     MULTIGRID,
@@ -123,13 +123,13 @@ class Jacobian:
         diagonal: Floats = unknowns.inertia[unknowns.free] + self.functional.t2 * stiffness
         return diagonal
 
-    def linearise(self, place: Place, projected: bool, duals: Duals | None) -> None:
-        """Linearise H and contact at a place; A is constant (collective).
+    def linearise(self, configuration: Configuration, projected: bool, duals: Duals | None) -> None:
+        """Linearise H and contact at a configuration; A is constant (collective).
 
         projected : leave out the negative parts of H
         duals     : duals of friction; None for its true curvature
         """
-        q, contact = place.q, place.contact
+        q, contact = configuration.q, configuration.contact
         if self.preset.true_hessian:
             self.hessian.linearise(q, contact, projected, duals)
         elif self.blocks:

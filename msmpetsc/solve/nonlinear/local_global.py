@@ -11,7 +11,7 @@ from petsc4py import PETSc
 
 from msmpetsc.errors import InputError
 from msmpetsc.solve.nonlinear.error_control import Outcome
-from msmpetsc.solve.nonlinear.functional import Iterate, Place
+from msmpetsc.solve.nonlinear.functional import Configuration, Iterate
 from msmpetsc.solve.nonlinear.method import StepMethod
 from msmpetsc.solve.petsc.events import LOCAL
 from msmpetsc.solve.refused_options import BY_ERROR
@@ -23,7 +23,7 @@ class LocalGlobal(StepMethod):
 
     prefix  : prefix of the options
     has_npc : whether a plain iteration preconditions SNES
-    base    : place to which changes of g are relative
+    base    : configuration to which changes of g are relative
     outcome : outcome of SNES's last iterate
     """
 
@@ -34,7 +34,7 @@ class LocalGlobal(StepMethod):
         super().__post_init__()
         vectors = self.functional.vectors
         self.x, self.f, self.own = vectors.take(), vectors.take(), vectors.take()
-        self.base = Place(self.functional.problem.q, None)
+        self.base = Configuration(self.functional.problem.q, None)
         self.outcome = Outcome()
         self.snes.setFunction(self._residual, self.f)
         self.snes.setJacobian(self._linearise, self.jacobian.operator)
@@ -86,14 +86,14 @@ class LocalGlobal(StepMethod):
         If the difference has no digits left, return -1, so that the line search accepts x.
         """
         with LOCAL:
-            place = self.functional.place(self.functional.positions(x))
-            change, distance = self.functional.change(place, self.base)
+            configuration = self.functional.configuration(self.functional.positions(x))
+            change, distance = self.functional.change(configuration, self.base)
         return -1.0 if self.outcome.is_flat and distance > 0 else change
 
     def _linearise(self, snes: PETSc.SNES, x: PETSc.Vec, _: PETSc.Mat, __: PETSc.Mat) -> None:
         """Linearise contact at x and set the initial guess of the linear solve (SNESJacobian)."""
         with LOCAL:
-            self.base = self.functional.place(self.functional.positions(x))
+            self.base = self.functional.configuration(self.functional.positions(x))
             self.jacobian.linearise(self.base, False, None)
         if self.preset.start_from_b:
             # CG solves A z = F for z = x - x_new; x_new = b = A x - F: z = x - A x + F
@@ -107,11 +107,11 @@ class LocalGlobal(StepMethod):
         if its > 0 or not self.has_npc:
             x = snes.getSolution()
             # With a nonlinear preconditioner, ``f`` belongs to another x
-            place = self.functional.place(self.functional.positions(x))
+            configuration = self.functional.configuration(self.functional.positions(x))
             if self.has_npc:
-                iterate = self.functional.evaluate(x, self.own, place)
+                iterate = self.functional.evaluate(x, self.own, configuration)
             else:
-                iterate = Iterate(place.q, place.contact, x, self.f)
+                iterate = Iterate(configuration.q, configuration.contact, x, self.f)
             self.outcome = self._judge(iterate)
         reason = self.reason_to_end(its, self.outcome)
         if not reason:

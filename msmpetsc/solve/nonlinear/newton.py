@@ -254,11 +254,11 @@ class Newton(StepMethod):
         while s > SHORTEST:
             x.waxpy(-s, self.y, now.x)
             with LOCAL:
-                place = self.functional.place(self.functional.positions(x))
-                self.friction.update(place.contact, now.contact, s == 1.0)
-                change, _ = (-np.inf, 0.0) if flat else self.functional.change(place, now)
+                configuration = self.functional.configuration(self.functional.positions(x))
+                self.friction.update(configuration.contact, now.contact, s == 1.0)
+                change, _ = (-np.inf, 0.0) if flat else self.functional.change(configuration, now)
                 if change <= ALPHA * s * slope:
-                    return self.functional.iterate(x, place)
+                    return self.functional.iterate(x, configuration)
             s, longer = shorter(slope, (s, change), longer), (s, change)
         self.functional.vectors.give_back(x)
         return None

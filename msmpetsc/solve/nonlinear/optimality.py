@@ -109,7 +109,7 @@ class Optimality:
         if not is_free:
             self.functional.vectors.give_back(x)
             return None
-        return self.functional.iterate(x, self.functional.place(q))
+        return self.functional.iterate(x, self.functional.configuration(q))
 
     def _corrected(self, at: Iterate) -> tuple[PETSc.Vec, Positions, bool]:
         """Return the unknowns x - e, their positions (l, 3) [m], and whether the path is free.
@@ -177,7 +177,7 @@ class Optimality:
             self.memory.write(x)[:] = self.memory.read(at.x) + move * direction
             q = functional.positions(x)
             is_free = functional.collision_free_step(at.q, q) == 1.0
-            change = functional.change(functional.place(q), at)[0] if is_free else np.inf
+            change = functional.change(functional.configuration(q), at)[0] if is_free else np.inf
             if change < lowest:
                 best, lowest = move, change
                 move *= 2

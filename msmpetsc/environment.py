@@ -16,7 +16,7 @@ from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.contact.obstacles.node_obstacles import NodeObstacles
 from msmpetsc.contact.step_contact import StepContact, StepContactAt
 from msmpetsc.contact.surface.pairs import ContactSearch, ContactSummary
-from msmpetsc.contact.surface.surface_contact import SurfaceContact
+from msmpetsc.contact.surface.surface_contact import SurfaceContact, SurfaceContactAt
 from msmpetsc.elasticity.energy import Elasticity
 
 # largest factor between the friction limit used in a step and mu N at its end [-];
@@ -101,6 +101,16 @@ class Environment:
             before = previous.surface if previous else None
             surface = SurfaceContact(self.contacts, start, time_step, last, pairs, before)
         return StepContact(states, self.lattice.owned, surface) if states or surface else None
+
+    def push(self, q: Positions, time: float, sides: Indices | None) -> StepContactAt | None:
+        """Return the contact at q and a time [s] without friction, or None (collective)."""
+        of_nodes = self.obstacles.push(time, sides)
+        if not self.contacts:
+            return of_nodes.at(q) if of_nodes else None
+        pairs = self.contacts.pairs_at(q, time)
+        # Points that have not slipped have no friction
+        surface = SurfaceContactAt(SurfaceContact(self.contacts, pairs, 1.0), pairs)
+        return replace((of_nodes or StepContact([], self.lattice.owned)).at(q), surface=surface)
 
     def begin_contacts(self, q: Positions, time: float, time_step: float) -> None:
         """Search the candidate pairs of the surface for a step from q that ends at ``time``.

@@ -382,8 +382,7 @@ class Forces:
         environment, owned = self.environment, self.model.lattice.owned
         contact = step.contact if step else None
         if contact is None:
-            acting = environment.obstacles.push(time, sides)
-            contact = acting.at(q) if acting else None
+            contact = environment.push(q, time, sides)
         loads = environment.forces.at(time)
         load = loads.at(q)
         sums = {"load": to_host(load.sum(axis=0)), **self._pushes(q, contact)}

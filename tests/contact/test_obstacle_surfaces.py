@@ -89,6 +89,16 @@ def test_a_block_comes_to_rest_on_a_floor_that_carries_its_weight(tmp_path: Path
     assert sum(frame.iterations for frame in frames[-10:]) < 32
 
 
+def test_frames_within_long_adaptive_steps_have_the_force_of_a_floor(tmp_path: Path):
+    time = {"step": 0.02, "duration": 1.0, "error": 0.5}
+    scene = fine_block(tmp_path, time=time, obstacle=[FLOOR], gravity=GRAVITY)
+    frames = play(scene)[1][-6:]
+    assert any(frame.steps == 0 for frame in frames)
+    for frame in frames:
+        assert frame.push[0, 2] == pytest.approx(WEIGHT, rel=0.2)
+        np.testing.assert_allclose(frame.contact_push[0], frame.push[0], atol=1e-9 * WEIGHT)
+
+
 def test_a_plate_presses_a_block_that_is_held_at_its_foot(tmp_path: Path):
     """A step moves the plate by many times the barrier's distance and carries near nodes along."""
     time = {"step": 0.05, "duration": 0.6}

@@ -7,8 +7,8 @@
 until the error of x_k is below the goal (error_control). Under compression H may be indefinite. CG
 then stops with the descent direction found so far. If CG's first direction has a negative
 curvature, no s lowers g. Then the projected Hessian, without negative parts, takes over for some
-iterations. It also takes over if CG stopped at an indefinite H and the surface would cross
-something almost at once along y: this y closes gaps whose stiffness CG has not met yet.
+iterations. It also takes over if the surface would cross something almost at once along y: this y
+closes gaps whose stiffness CG has not met yet.
 """
 
 from dataclasses import dataclass, replace
@@ -41,8 +41,8 @@ LEAST, MOST = 0.1, 0.5
 SHORTEST = 1e-6
 # Share of the slope that a direction must keep if bent at obstacles [-]
 DOWNHILL = 0.1
-# Collision-free step length [-] along a direction of an indefinite H, below which the
-# projected Hessian takes over
+# Collision-free step length [-] along a direction, below which the projected Hessian
+# takes over
 STUCK = 0.01
 # Options of PETSc's own convergence test of a linear solve
 TESTS = (
@@ -134,8 +134,7 @@ class Newton(StepMethod):
                 continue
             if its == 0:
                 self.control.missed = self._missed(lower.f, outcome)
-            is_stuck = share < STUCK and self.ksp.reason == KSP.DIVERGED_INDEFINITE_MAT
-            projected, its = max(projected - 1, PROJECTED * is_stuck), its + 1
+            projected, its = max(projected - 1, PROJECTED * (share < STUCK)), its + 1
             now, outcome = lower, self._judge(lower, outcome, projected)
         self.iterations += its
         self._given = now, outcome

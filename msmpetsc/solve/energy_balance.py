@@ -80,6 +80,22 @@ class Energies:
         return self.free + self.elastic + self.contact + self.touch.energy
 
 
+@dataclass(frozen=True)
+class SolvedStep:
+    """Step to be examined.
+
+    before, after : states before and after the step
+    time          : its end [s]
+    time_step     : its length [s]
+    """
+
+    before: State
+    result: StepResult
+    after: State
+    time: float
+    time_step: float
+
+
 @dataclass(eq=False)
 class EnergyBalance:
     """Check the energy of each step of a run; the states carry the energy budget.
@@ -147,22 +163,13 @@ class EnergyBalance:
         # An equilibrium does not depend on earlier energy.
         if result.static:
             return replace(after, budget=before.budget), False
-        sums = self._start(before, result, after, time, time_step)
-        budget = self._budget_after(before, result, after, time, time_step, sums)
-        gains = before.history is not None and self._history_gains(
-            before, result, after, time, time_step, sums
-        )
+        step = SolvedStep(before, result, after, time, time_step)
+        sums = self._start(step)
+        budget = self._budget_after(step, sums)
+        gains = before.history is not None and self._history_gains(step, sums)
         return replace(after, budget=budget), gains
 
-    def _history_gains(
-        self,
-        before: State,
-        result: StepResult,
-        after: State,
-        time: float,
-        time_step: float,
-        resting: Floats,
-    ) -> bool:
+    def _history_gains(self, step: SolvedStep, resting: Floats) -> bool:
         """Return whether a solved step gains more than NOTABLE_GAIN of all energy (collective).
 
         Energy and work are counted in a frame that moves with the obstacles that press at the start
@@ -172,15 +179,19 @@ class EnergyBalance:
 
         resting : (5,) terms [J] of ``_start`` in a frame at rest
         """
-        lattice, owned = self.lattice, slice(self.lattice.owned)
+        lattice, owned, time_step = self.lattice, slice(self.lattice.owned), step.time_step
+        before, result, after = step.before, step.result, step.after
         displacement = result.position[owned] - result.previous[owned]
         pressing, dragged = self.environment.obstacles.pressing_displacement(
-            (before.q[owned], before.sides), (result.position[owned], after.sides), time, time_step
+            (before.q[owned], before.sides),
+            (result.position[owned], after.sides),
+            step.time,
+            time_step,
         )
         if result.contact and result.contact.surface:
             pushed, carried = result.contact.surface.pressing_displacement()
             pressing, dragged = pressing + pushed, dragged + carried
-        is_fixed = self.environment.anchors.fixed_at(time)[owned].any(axis=0)
+        is_fixed = self.environment.anchors.fixed_at(step.time)[owned].any(axis=0)
         sums = self._sums(
             lattice.mass.sum(),
             pressing,
@@ -192,33 +203,25 @@ class EnergyBalance:
         moving = sums[5:8] / (pressing * time_step) if pressing > 0 else momentum / mass
         frame = np.where(is_fixed, 0.0, moving)
         # Impacts follow the solve, so the next step starts with their energy.
-        is_moving = frame.any()
-        terms = self._start(before, result, after, time, time_step, frame) if is_moving else resting
-        start, _, work, _, _ = terms
+        start, _, work, _, _ = self._start(step, frame) if frame.any() else resting
         ended = self.energies.inner - momentum @ frame + 0.5 * mass * frame @ frame
         gained = ended - start - work
         return bool(gained > NOTABLE_GAIN * max(start + max(work, 0.0), self.floor))
 
-    def _budget_after(
-        self,
-        before: State,
-        result: StepResult,
-        after: State,
-        time: float,
-        time_step: float,
-        sums: Floats,
-    ) -> EnergyBudget:
+    def _budget_after(self, step: SolvedStep, sums: Floats) -> EnergyBudget:
         """Return the energy budget after a step (collective). Raises StepFailed.
 
         sums : (5,) [J], as ``_start`` returns them
         """
         solved = ended = self.energies
+        result, after = step.result, step.after
         # Obstacles that reflect nodes change the state after the solve.
         is_changed = after.q is not result.position or after.q_previous is not result.previous
         bounces = self.environment.obstacles.strikes and reduced(self.comm, is_changed, MPI.LOR)
         if bounces:
-            ended = self._energies(after.q, after.velocity(time_step), time, after.sides)
-        budget = self._updated(before.budget, solved, ended, sums, bounces)
+            velocity = after.velocity(step.time_step)
+            ended = self._energies(after.q, velocity, step.time, after.sides)
+        budget = self._updated(step.before.budget, solved, ended, sums, bounces)
         if budget.gained > FAILING_GAIN * budget.put_in:
             raise StepFailed(
                 f"gained {budget.gained:.2e} J from nowhere, of {budget.put_in:.2e} J that were "
@@ -267,15 +270,7 @@ class EnergyBalance:
             return "a smaller time.substep"
         return "a smaller time.step or a smaller solver.error"
 
-    def _start(
-        self,
-        before: State,
-        result: StepResult,
-        after: State,
-        time: float,
-        time_step: float,
-        frame: Floats | float = 0.0,
-    ) -> Floats:
+    def _start(self, step: SolvedStep, frame: Floats | float = 0.0) -> Floats:
         """Return the terms (5,) [J] of the right side of the balance (collective).
 
         The terms are the energy at the start, its contact part, the work of loads and friction, the
@@ -284,7 +279,8 @@ class EnergyBalance:
         frame : velocity (3,) [m/s] of the frame in which energies and work are counted
         """
         lattice, environment = self.lattice, self.environment
-        owned = slice(lattice.owned)
+        before, result, after = step.before, step.result, step.after
+        time, time_step, owned = step.time, step.time_step, slice(lattice.owned)
         q, v = before.q, before.velocity(time_step)[owned]
         if result.explicit:
             when, sides = time - time_step, before.sides

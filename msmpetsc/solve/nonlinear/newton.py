@@ -213,10 +213,10 @@ class Newton(StepMethod):
     def _trust(self, now: Iterate, outcome: Outcome) -> float:
         """Return a lower bound of |y|_M over the error; 0 if y does not bound the error.
 
-        Let H miss theta |F(x)| of F(x - y). Then Newton's corrections shrink by
-        about theta, and the error is at most |y|_M / (1 - theta) (Deuflhard 2011, Newton Methods
-        for Nonlinear Problems, Sect. 2.1). Contact has kinks that no H predicts. With contact,
-        |y|_M counts as the error.
+        Let H miss theta |F(x)| of F(x - y). Then Newton's corrections shrink by about theta, and
+        the error is at most |y|_M / (1 - theta) (Deuflhard 2011, Newton Methods for Nonlinear
+        Problems, Sect. 2.1). Contact has kinks that no H predicts. With contact, |y|_M counts as
+        the error.
         """
         if now.contact:
             return 1.0

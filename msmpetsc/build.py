@@ -46,6 +46,7 @@ from msmpetsc.lattice.nearest_points import NodePoints, nearest_of_body
 from msmpetsc.lattice.probes import ProbePoints, probe_points
 from msmpetsc.lattice.region import Finder
 from msmpetsc.lattice.topology import topology_of
+from msmpetsc.scene.body import CagesTable
 from msmpetsc.scene.motion import Gravity, Traction
 from msmpetsc.scene.obstacles import BARRIER, ObstacleTable
 from msmpetsc.scene.reading import Scene
@@ -147,7 +148,7 @@ class Geometry:
         """Read the meshes and fill them with cells (collective). Raises InputError on all ranks."""
         self.source = scene.folder, scene.meshes, scene.cages
         self.bodies = read_bodies(comm, scene)
-        self.cages = fill_cages(self.bodies, scene)
+        self.cages = fill_cages(self.bodies, scene.cages)
         self.topology = topology_of(self.cages)
         nodes = self.topology.table.total
         if nodes < comm.size:
@@ -197,15 +198,15 @@ def build_model(
     geometry = geometry or Geometry(comm, scene)
     bodies, cages = geometry.bodies, geometry.cages
     finder = Finder(bodies, cages, scene.folder)
-    materials = cell_materials(scene, finder)
+    own_materials = [body.material for body in scene.body]
+    materials = cell_materials(scene.material, own_materials, scene.tables("part"), finder)
     lattice = build_lattice(cages, scene.material, materials, geometry.topology)
-    tables = [*scene.tables(*HOLDERS, "force")]
+    held = [*scene.tables(*HOLDERS)]
+    tables = [*held, *scene.tables("force")]
     own = NodePoints(lattice.nodes, np.zeros(len(lattice.nodes), bool))
     nearest = geometry.nearest if tables else own
     masks = {table.key: finder.find(table, lattice, nearest) for table in tables}
-    components = {
-        t.key: masks[t.key][:, None] & np.array(t.table.fixed) for t in scene.tables(*HOLDERS)
-    }
+    components = {t.key: masks[t.key][:, None] & np.array(t.table.fixed) for t in held}
     lattice = lattice.pin(
         reduce(np.logical_or, (components[pin.key] for pin in scene.tables("pin")), lattice.fixed)
     )
@@ -213,16 +214,16 @@ def build_model(
     anchors = _anchors(scene.tables("anchor"), lattice, components, holders)
     fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.fixed)
     outside = geometry.outside(lattice.nodes) if scene.obstacle else None
-    obstacles = build_obstacles(comm, scene, lattice, outside)
+    obstacles = build_obstacles(comm, scene.obstacle, scene.folder, lattice, outside)
     loads, own_forces = _loads(comm, scene.gravity, scene.tables("force"), lattice, masks)
-    areas, pressures = _surface_loads(scene, finder, lattice)
+    areas, pressures = _surface_loads(scene.tables(*SURFACE_LOADS), finder, lattice)
     loads += areas
     lattice = replace(lattice, pressed=tuple(pressure.part for pressure in pressures))
     probes = probe_points(bodies, scene.output.probe)
     exchanges, penalties = _contacts(comm, scene.obstacle, lattice, finder.bounds, obstacles)
     model = Model(
         surface=joined([body.surface for body in bodies if body.surface is not None]),
-        lattice=clamped(scene, lattice, masks, finder, nearest.points),
+        lattice=clamped(held, lattice, masks, finder, nearest.points),
         embedding=geometry.embedding if scene.output.surface else None,
         loads=loads,
         own_forces=own_forces,
@@ -234,7 +235,7 @@ def build_model(
         start=initial_state(comm, scene.starts, lattice, fixed, finder.bounds, read_state),
         bodies=bodies,
         collision=collision_surface(scene, bodies, cages, lattice, obstacles),
-        node_counts=taken(comm, scene, lattice, anchors, masks),
+        node_counts=taken(comm, tables, lattice, anchors, masks),
         damping=scene.material.damping,
         retardation=scene.material.retardation_time,
         obstacles=tuple(obstacles),
@@ -342,11 +343,10 @@ def _check_size(surface: Surface, size: float | None) -> list[str]:
     ]
 
 
-def fill_cages(bodies: Sequence[BodySurface], scene: Scene) -> Cages:
-    """Return the scene's valid cells (collective)."""
-    cages = scene.cages
-    cell_size = cages.cell_size or choose_cell_size(bodies, cages.count or 0, cages.max_cells)
-    return fill(bodies, cell_size, cages.max_cells, cages.boundary)
+def fill_cages(bodies: Sequence[BodySurface], table: CagesTable) -> Cages:
+    """Return the valid cells of the bodies (collective)."""
+    cell_size = table.cell_size or choose_cell_size(bodies, table.count or 0, table.max_cells)
+    return fill(bodies, cell_size, table.max_cells, table.boundary)
 
 
 def _anchors(
@@ -404,14 +404,14 @@ def _loads(
 
 
 def _surface_loads(
-    scene: Scene, finder: Finder, lattice: Lattice
+    tables: Iterable[OfBody], finder: Finder, lattice: Lattice
 ) -> tuple[list[Load], list[PressureLoad]]:
     """Return the tractions and the pressures (collective).
 
     Raises InputError for a region without triangles, or a pressure without a potential.
     """
     tractions, pressures = [], []
-    for table in scene.tables(*SURFACE_LOADS):
+    for table in tables:
         part, load = surface_part(table, finder, lattice), table.table
         acts = {"start": load.start, "stop": load.stop, "total": total_of(load.value)}
         if isinstance(load, Traction):

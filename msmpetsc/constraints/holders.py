@@ -16,10 +16,9 @@ the sum of reactions, loads and pushes is the sum of m a.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
-from itertools import chain
 
 import numpy as np
 from mpi4py import MPI
@@ -30,7 +29,8 @@ from msmpetsc.constraints.anchors import Anchor
 from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.region import Finder
-from msmpetsc.scene.reading import Scene
+from msmpetsc.scene.motion import AnchorTable, Force, Pin
+from msmpetsc.scene.schema import OfBody
 
 # least free fraction theta of a spring [-]; stiff springs cost iterations and substeps
 LEAST = 0.1
@@ -102,21 +102,22 @@ def sums_by(number: Indices, vectors: Rows, count: int) -> Rows:
 
 
 def clamped(
-    scene: Scene, lattice: Lattice, masks: Regions, finder: Finder, points: Positions
+    holders: Sequence[OfBody],
+    lattice: Lattice,
+    masks: Regions,
+    finder: Finder,
+    points: Positions,
 ) -> Lattice:
     """Return the lattice with stiffer springs, or cells, at the edges of pins and lasting anchors.
 
     A lasting anchor has no ``stop``.
 
-    masks  : local nodes (l,) of each table
-    points : (l, 3) body points nearest to the nodes [m]
+    holders : tables of pins and anchors
+    masks   : local nodes (l,) of each table
+    points  : (l, 3) body points nearest to the nodes [m]
     """
-    lasting = (table for table in scene.tables("anchor") if table.table.stop is None)
-    tables = [
-        t
-        for t in chain(scene.tables("pin"), lasting)
-        if all(t.table.fixed) and not t.table.region.is_of_mesh
-    ]
+    lasting = (t for t in holders if isinstance(t.table, Pin) or t.table.stop is None)
+    tables = [t for t in lasting if all(t.table.fixed) and not t.table.region.is_of_mesh]
     is_fixed = np.any(
         [np.zeros(len(points), bool), *(masks[table.key] for table in tables)], axis=0
     )
@@ -183,12 +184,17 @@ def _free_fraction(within: Within, start: Positions, end: Positions) -> Floats:
 
 
 def taken(
-    comm: MPI.Comm, scene: Scene, lattice: Lattice, anchors: list[Anchor], masks: Regions
+    comm: MPI.Comm,
+    tables: Sequence[OfBody],
+    lattice: Lattice,
+    anchors: list[Anchor],
+    masks: Regions,
 ) -> tuple[str, ...]:
     """Return how many nodes rollers, anchors and forces have, in words; warn of conflicts.
 
     Collective.
 
+    tables  : tables of pins, anchors and forces
     lattice : the lattice with its pins
     anchors : the anchors without components that a pin or an earlier anchor holds
     masks   : local nodes (l,) in the region of each table
@@ -199,12 +205,16 @@ def taken(
     def count(where: Mask) -> int:
         return int(comm.allreduce(int(where[: lattice.owned].sum())))
 
+    pins, leading, forces = (
+        [table for table in tables if isinstance(table.table, kind)]
+        for kind in (Pin, AnchorTable, Force)
+    )
     words = [
         f"{table.key} holds {', '.join(table.table.fix)} of {count(masks[table.key])} nodes"
-        for table in scene.tables("pin")
+        for table in pins
         if not all(table.table.fixed)
     ]
-    for table, anchor in zip(scene.tables("anchor"), anchors, strict=True):
+    for table, anchor in zip(leading, anchors, strict=True):
         where = masks[table.key]
         nodes = count(where)
         pinned = count(where & lattice.fixed[:, table.table.fixed].all(axis=1))
@@ -216,7 +226,7 @@ def taken(
                 raise InputError(f"{text}: it leads none")
             log.warning("%s, which it does not lead", text)
         words.append(f"{table.key} leads {anchored} nodes")
-    for table in scene.tables("force"):
+    for table in forces:
         where, force = masks[table.key], table.table
         until = math.inf if force.stop is None else force.stop
         # an anchor cancels a force only if it holds the node as long as the force acts

@@ -11,7 +11,7 @@ With a single material w is 1. If one of two materials has no stiffness, the cel
 that the surface cuts (lattice.cut_cells, lattice.cell_moments).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +21,6 @@ from msmpetsc.lattice.cell_samples import COUNT, CellSamples
 from msmpetsc.lattice.material import CellMaterial, MaterialOfCells, MixedCells
 from msmpetsc.lattice.region import Finder
 from msmpetsc.scene.body import Material, OwnMaterial
-from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.schema import OfBody
 
 
@@ -35,14 +34,19 @@ class Constant(NamedTuple):
     of_samples: Rows
 
 
-def cell_materials(scene: Scene, finder: Finder) -> MaterialOfCells | None:
+def cell_materials(
+    material: Material,
+    bodies: Sequence[OwnMaterial | None],
+    part_tables: Iterable[OfBody],
+    finder: Finder,
+) -> MaterialOfCells | None:
     """Return a collective function from keys (c,) of cells to their materials.
 
     Return None if all cells have the scene's material.
+
+    bodies : own material of each body that has a table
     """
-    material = scene.material
-    parts = list(scene.tables("part"))
-    bodies = [body.material for body in scene.body]
+    parts = list(part_tables)
     if not parts and not any(bodies):
         return None
     (spring,) = (name for name in Material.one_of if getattr(material, name) is not None)

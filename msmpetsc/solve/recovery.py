@@ -24,7 +24,6 @@ from typing import ClassVar
 from msmpetsc.checkpoint import COUNT, Range
 from msmpetsc.comm import log
 from msmpetsc.errors import StepFailed
-from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
@@ -108,10 +107,18 @@ class Recovery:
 
     state: ClassVar[dict[str, Range]] = {"level": (0, DEEPEST), "recovered": COUNT}
 
-    def __init__(self, scene: Scene, make: MakeIntegrator, balance: EnergyBalance, take: TakeStep):
-        self.time, self.solver = scene.time, scene.solver
+    def __init__(
+        self,
+        time: Time,
+        solver: Solver,
+        on_failure: str,
+        make: MakeIntegrator,
+        balance: EnergyBalance,
+        take: TakeStep,
+    ):
+        self.time, self.solver = time, solver
         self.make, self.balance, self.take = make, balance, take
-        self.on_failure, self.time_step = scene.safety.on_failure, scene.time.step
+        self.on_failure, self.time_step = on_failure, time.step
         self.spare: dict[int, Integrator] = {}
         self.recovered = self.level = 0
 

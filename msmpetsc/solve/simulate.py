@@ -137,13 +137,15 @@ class TimeLoop:
         self.balance = EnergyBalance(self.environment, self.elasticity, swings)
         self.adaptive: Adaptive | None = None
         if scene.time.error:
-            self.adaptive = Adaptive(scene, self._make, self.balance)
+            self.adaptive = Adaptive(scene.time, scene.solver, self._make, self.balance)
         self.integrator = self.adaptive or self._make(scene.time, scene.solver)
         take: TakeStep = partial(take_step, self.balance, self.integrator)
         # Adaptive passes each of its own steps through the energy balance.
         if self.adaptive:
             take = self.adaptive.advance
-        self.recovery = Recovery(scene, self._make, self.balance, take)
+        self.recovery = Recovery(
+            scene.time, scene.solver, scene.safety.on_failure, self._make, self.balance, take
+        )
         self.monitors, self.true_errors = Monitors(self.environment, self.time_step), TrueErrors()
         w = model.embedding
         self.surface = None if w is None else EmbeddedPoints(comm, model.lattice, w)

@@ -109,7 +109,7 @@ def test_a_scene_too_large_to_build_is_scaled_and_says_so(scene: Path, capsys, m
     monkeypatch.setattr("msmpetsc.cli.commands.inspect.MOST_BUILT", 1000)
     many = "cages={count = 800000, max_cells = 100000}"
     with pytest.raises(InputError, match=r"more than cages\.max_cells"):
-        fill_cages(read_bodies(SELF, load_scene(scene)), load_scene(scene, [many]))
+        fill_cages(read_bodies(SELF, load_scene(scene)), load_scene(scene, [many]).cages)
     assert status_of("inspect", scene, "--ranks", "8", "--set", many) == 0
     told = capsys.readouterr()
     assert "scaled from a lattice of" in told.out and "run refuses 800000 cells" in told.err

@@ -1,5 +1,6 @@
 """Moving obstacles, built from a scene's tables, and the depths of nodes in obstacles."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,7 +21,6 @@ from msmpetsc.geometry.surface import Surface, check_encloses, examine
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.scene.body import MeshTable
 from msmpetsc.scene.obstacles import ObstacleTable
-from msmpetsc.scene.reading import Scene
 
 # greatest depth that counts as touching, not as overlap [cells]; above rounding
 TOUCHING = 1e-6
@@ -92,18 +92,23 @@ class Obstacle(Timed):
 
 
 def build_obstacles(
-    comm: MPI.Comm, scene: Scene, lattice: Lattice, outside: Floats | None
+    comm: MPI.Comm,
+    tables: Sequence[ObstacleTable],
+    folder: Path,
+    lattice: Lattice,
+    outside: Floats | None,
 ) -> list[Obstacle]:
-    """Return the obstacles of a scene (collective).
+    """Return the obstacles of a scene's tables (collective).
 
+    folder  : folder that paths of meshes start from
     outside : (l,) distance by which nodes lie outside the surface at rest [m]
 
     Raises InputError on all ranks if a mesh is not closed or a function is not a signed distance.
     """
     obstacles = []
-    for number, table in enumerate(scene.obstacle):
+    for number, table in enumerate(tables):
         key = f"obstacle.{number}"
-        solid = _solid(comm, table, key, scene.folder, lattice.nodes[: lattice.owned])
+        solid = _solid(comm, table, key, folder, lattice.nodes[: lattice.owned])
         path = Motion.through(table.path, table.center)
         obstacles.append(Obstacle(solid, path, key, outside, start=table.start, stop=table.stop))
     return obstacles

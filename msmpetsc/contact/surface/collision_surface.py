@@ -66,7 +66,7 @@ def collision_surface(
     prepared = on_root(comm, lambda: _prepared(whole, table, meets_itself, lattice.cell_size))
     surfaces, *lengths = prepared or ([],)
     off, edge = comm.bcast(lengths)
-    met = obstacle_surfaces(scene, obstacles, edge)
+    met = obstacle_surfaces(scene.obstacle, obstacles, edge)
     points = [surface.points for surface in surfaces] or [np.empty((0, 3))] * len(bodies)
     embedding = embed(points, cages, lattice.table, scene.cages.embedding, scene.cages.smoothing)
     sides = max((body.bounds[1] - body.bounds[0] for body in bodies), key=np.linalg.norm)

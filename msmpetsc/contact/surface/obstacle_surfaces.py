@@ -13,7 +13,6 @@ from msmpetsc.contact.obstacles.moving_solid import Obstacle
 from msmpetsc.geometry.prepare import merge
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.scene.obstacles import BARRIER, ObstacleTable
-from msmpetsc.scene.reading import Scene
 
 # Longest edge of an obstacle [mean edges of the bodies]; larger triangles would push
 # stiffly
@@ -123,14 +122,16 @@ class ObstacleSurfaces:
         return moved + near * (carried / weights - moved)
 
 
-def obstacle_surfaces(scene: Scene, obstacles: list[Obstacle], edge: float) -> ObstacleSurfaces:
+def obstacle_surfaces(
+    tables: Sequence[ObstacleTable], obstacles: list[Obstacle], edge: float
+) -> ObstacleSurfaces:
     """Return the surfaces of barrier obstacles.
 
     edge : mean length of the bodies' edges [m]
     """
-    numbers = [number for number, table in enumerate(scene.obstacle) if table.response == BARRIER]
+    numbers = [number for number, table in enumerate(tables) if table.response == BARRIER]
     met = [obstacles[number] for number in numbers]
-    whole = (_surface_of(scene.obstacle[number], obstacles[number]) for number in numbers)
+    whole = (_surface_of(tables[number], obstacles[number]) for number in numbers)
     return ObstacleSurfaces(numbers, met, [_split(solid, LONGEST_EDGE * edge) for solid in whole])
 
 

@@ -29,7 +29,6 @@ from msmpetsc.checkpoint import COUNT, LENGTH, Checkpoint, Range
 from msmpetsc.comm import log, reduced
 from msmpetsc.constraints.time_functions import AT_EVENT
 from msmpetsc.errors import StepFailed
-from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
@@ -221,18 +220,22 @@ class Adaptive(Integrator):
     uses_history = True
 
     def __init__(
-        self, scene: Scene, make: Callable[[Time, Solver], Integrator], balance: EnergyBalance
+        self,
+        time: Time,
+        solver: Solver,
+        make: Callable[[Time, Solver], Integrator],
+        balance: EnergyBalance,
     ):
-        assert scene.time.error is not None
+        assert time.error is not None
         self.balance, self.comm = balance, balance.comm
         self.lattice, self.environment = balance.lattice, balance.environment
-        self.make, self.solver = make, scene.solver
-        self.time, self.time_step = scene.time, scene.time.step
-        self.order = ORDERS[scene.time.integrator]
-        steps = scene.time.steps
+        self.make, self.solver = make, solver
+        self.time, self.time_step = time, time.step
+        self.order = ORDERS[time.integrator]
+        steps = time.steps
         self.levels = LOWEST, HIGHEST
         self.control = StepControl(
-            self.order, scene.time.error, self.time_step, steps * self.time_step, self.levels
+            self.order, time.error, self.time_step, steps * self.time_step, self.levels
         )
         self.ticks = Ticks(self.time_step, steps, self.levels[0], self.environment.events())
         self.integrator: Integrator | None = None

@@ -34,7 +34,7 @@ from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 ALIKE = 0.9
 # Growth of the compression, or of the mode's curvature, beyond which another mode may
 # be the lowest [-]
-MORE = 1.5
+MORE = 2.0
 # Relative change of the mode's curvature up to which the mode is not searched again [-]
 UNCHANGED = 0.1
 

@@ -27,9 +27,6 @@ from msmpetsc.solve.nonlinear.jacobian import FrictionDuals
 from msmpetsc.solve.nonlinear.method import REASON, StepMethod
 from msmpetsc.solve.petsc.events import LOCAL
 
-# Number of iterations with the projected Hessian, which converges slowly, before the
-# true Hessian is tried
-PROJECTED = 5
 # Growth of |F| in the first iteration of a static state beyond which softer solids are
 # solved first [-]; also the ratio of lambda from a softer solid to the next
 SOFTER = 9.0
@@ -39,10 +36,8 @@ ALPHA = 1e-4
 LEAST, MOST = 0.1, 0.5
 # Least step length [-]; along a rising direction g may seem to fall by rounding
 SHORTEST = 1e-6
-# Share of the slope that a direction must keep if bent at obstacles [-]
-DOWNHILL = 0.1
-# Collision-free step length [-] along a direction, below which the projected Hessian
-# takes over
+# Collision-free step length [-] along a direction, below which the next iteration takes
+# the projected Hessian
 STUCK = 0.01
 # Options of PETSc's own convergence test of a linear solve
 TESTS = (
@@ -108,12 +103,11 @@ class Newton(StepMethod):
         """Run the loop of the method; PETSc calls it in SNESSolve."""
         assert self._given is not None
         now, outcome = self._given
-        # Iterations left with the projected Hessian
-        projected, its = self.preset.projected, 0
+        projected, its = self.preset.projected > 0, 0
         outcome = self._judge(now, replace(outcome, residual=np.inf), projected)
         while not (reason := self._reason(snes, its, now, outcome)):
             tells_error = self._tells_error(now, outcome, projected)
-            self._linearise(now, tells_error, projected > 0)
+            self._linearise(now, tells_error, projected)
             if its == 0 and (monitor := self.functional.problem.system_monitor):
                 monitor(now, self.jacobian)
             outcome = self._solve(now, outcome, tells_error)
@@ -130,11 +124,12 @@ class Newton(StepMethod):
                 reason = self.reason_to_end(its, outcome) or REASON.DIVERGED_LINE_SEARCH
                 break
             if lower is None:
-                projected = PROJECTED
+                projected = True
                 continue
             if its == 0:
                 self.control.missed = self._missed(lower.f, outcome)
-            projected, its = max(projected - 1, PROJECTED * (share < STUCK)), its + 1
+            its += 1
+            projected = share < STUCK or its < self.preset.projected
             now, outcome = lower, self._judge(lower, outcome, projected)
         self.iterations += its
         self._given = now, outcome
@@ -157,18 +152,18 @@ class Newton(StepMethod):
             int(REASON.DIVERGED_MAX_IT) if its == most else 0
         )
 
-    def _judge(self, iterate: Iterate, before: Outcome, projected: int) -> Outcome:
+    def _judge(self, iterate: Iterate, before: Outcome, projected: bool) -> Outcome:
         """Return the outcome at an iterate; estimate the error if the linear solve will not."""
         outcome = self.control.judge(iterate, before)
         if self._can_tell_error(projected):
             return outcome
         return self.control.estimated_if_near(iterate, outcome)
 
-    def _can_tell_error(self, projected: int) -> bool:
+    def _can_tell_error(self, projected: bool) -> bool:
         """Return whether the next linear solve has the true elastic Hessian and the error test."""
         return self.is_tested and not projected and self.slopes is None
 
-    def _tells_error(self, now: Iterate, outcome: Outcome, projected: int) -> bool:
+    def _tells_error(self, now: Iterate, outcome: Outcome, projected: bool) -> bool:
         """Return whether the next linear solve tests the error of x.
 
         With contact the solve tests the error only near the goal. Farther away, duals replace the
@@ -281,8 +276,8 @@ class Newton(StepMethod):
         """Bend y so that nodes stop at obstacles that they would enter.
 
         H at x lacks obstacles that nodes do not touch yet. If the line search shortened the whole
-        step for these nodes, they would come into contact one by one. If the bent direction hardly
-        descends, y stays as it is.
+        step for these nodes, they would come into contact one by one. If the bent direction does
+        not descend, y stays as it is.
 
         end : positions (l, 3) [m] at x - y
 
@@ -296,7 +291,7 @@ class Newton(StepMethod):
         # Fixed nodes stay at their places
         free = functional.positions(bent)
         bent.aypx(-1.0, now.x)
-        if not bent.dot(now.f) > DOWNHILL * self.y.dot(now.f):
+        if not bent.dot(now.f) > 0:
             return end
         bent.copy(self.y)
         return free

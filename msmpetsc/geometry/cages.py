@@ -23,11 +23,7 @@ from msmpetsc.geometry.partition import SortedKeys, places_of, ranges
 from msmpetsc.geometry.parts_of_points import PartsOfPoints
 from msmpetsc.geometry.surface import Surface, SurfaceReport, is_inside
 from msmpetsc.geometry.thickness import Thickness
-from msmpetsc.geometry.valid_cells import (
-    cells_of_gaps,
-    gaps_between,
-    touched_cells,
-)
+from msmpetsc.geometry.valid_cells import cells_of_gaps, gaps_between, touched_cells
 
 BOUNDARY, INTERIOR = 1, 2
 # least fill of a corner [-]; gives a corner far from the inside some mass
@@ -228,8 +224,7 @@ def _cells_of(
     kind = np.repeat(np.array([BOUNDARY, INTERIOR], np.uint8), [count, len(interior)])
     fills, moments = np.ones((len(ijk), 2, 2, 2)), np.full((len(ijk), 3), 1 / 12)
     if is_weighted and cells.columns:
-        of_corners, of_cells = cells.columns.inside(cells.boundary)
-        cut = of_corners.transpose(0, *(1 + axes)), of_cells[:, axes]
+        cut = cells.columns.corners.transpose(0, *(1 + axes)), cells.columns.moments[:, axes]
         fills[:count], moments[:count] = _clipped(*cut)
     elif is_weighted:
         cut = sampled_inside(body.comm.bcast(body.surface), grid, ijk[:count])
@@ -303,15 +298,16 @@ def _slab_cells(body: BodySurface, grid: Grid) -> SlabCells:
     edges = shape[0] * np.arange(body.comm.size + 1) // body.comm.size
     limits = np.array([edges[rank], 0, 0]), np.array([edges[rank + 1], *shape[1:]])
     corners = _slab_triangles(body, grid, axes, edges)
-    touched = marked_cells(corners, *limits)
+    of_pair, number = touched_cells(corners, *limits)
+    keys, place = np.unique(of_pair, return_inverse=True)
+    touched = unpacked(keys)
     if body.report.closed:
         outwards = corners if body.report.volume > 0 else corners[:, ::-1]
-        columns = Columns.crossed(outwards, *limits)
+        columns = Columns.crossed(outwards, number, place, keys)
         if body.comm.allreduce(columns.leak, MPI.MAX) < LEAK:
-            gaps = gaps_between(touched)
+            gaps, above = gaps_between(touched)
             # winding numbers are 1 inside and 0 outside
-            is_inside_body = columns.inside(gaps[:, [0, 1, 3]])[0][:, 0, 0, 0] > 0.5
-            return SlabCells(touched, gaps[is_inside_body], columns)
+            return SlabCells(touched, gaps[columns.below[above, 0, 0] > 0.5], columns)
     return SlabCells(touched, _gaps_by_winding(body, grid, axes, edges, touched), None)
 
 
@@ -339,12 +335,6 @@ def _slab_triangles(body: BodySurface, grid: Grid, axes: Indices, edges: Indices
     first, last = np.searchsorted(edges[1:], extents, side="right")
     copies = last - first + 1
     return Route(body.comm, ranges(first, copies)).send(np.repeat(corners, copies, axis=0))
-
-
-def marked_cells(corners: Rows, low: Indices, high: Indices) -> Indices:
-    """Return the distinct cells (b, 3), low <= cell < high, that triangles touch, in order."""
-    touched, _ = touched_cells(corners, low, high)
-    return unpacked(np.unique(touched))
 
 
 def _gaps_by_winding(

@@ -26,10 +26,10 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Floats, Indices, Rows
 from msmpetsc.backend.kernel import njit
-from msmpetsc.geometry.grid import CHUNK, Grid, packed
+from msmpetsc.geometry.grid import CHUNK, Grid, unpacked
 from msmpetsc.geometry.morton import LIMIT
 from msmpetsc.geometry.surface import Surface, is_inside
-from msmpetsc.geometry.valid_cells import clip_between, extent, grown
+from msmpetsc.geometry.valid_cells import clip_to_cell
 
 # samples along an axis of a cut cell [-]; the fill beside a plane errs by 0.6% rms
 SAMPLES = 6
@@ -53,28 +53,29 @@ WEIGHTS = np.repeat([0.223381589678011, 0.109951743655322], 3)
 
 @dataclass(frozen=True)
 class Columns:
-    """Fill of the cells that triangles cross, in lexicographic order.
+    """Fill of ascending cells that contain all cells crossed by triangles.
 
-    keys    : (c,) keys of the cells (grid.packed)
     corners : (c, 2, 2, 2) fills of their corners; material inside two parts counts twice
     moments : (c, 3) second moments about the middle of the cell [cells^5]: 1/12 in a full cell
     below   : (c, 2, 2) winding number below the cell: mean over the base, weighted by the bilinear
               function of each corner
+    leak    : largest winding number below a column: 0 for a closed, consistently wound surface
     """
 
-    keys: Indices
     corners: Rows
     moments: Rows
     below: Rows
+    leak: float
 
     @classmethod
-    def crossed(cls, triangles: Rows, low: Indices, high: Indices) -> "Columns":
-        """Return the columns of triangles (f, 3, 3) in cells low <= cell < high, (3,) int each."""
-        starts = range(0, max(1, len(triangles)), CHUNK)
-        pieces = (_pieces(triangles[start : start + CHUNK], low, high) for start in starts)
-        parts = [_sums_of_keys(packed(cells), values) for cells, values in pieces]
-        keys, sums = _sums_of_keys(*map(np.concatenate, zip(*parts, strict=True)))
-        above = _sums_above(keys // LIMIT, sums[:, :SEEN])
+    def crossed(cls, triangles: Rows, number: Indices, place: Indices, keys: Indices) -> "Columns":
+        """Return the columns of triangles (f, 3, 3) in cells with keys (c,) (grid.packed).
+
+        number, place : (n,) triangle and row of the cell, for each triangle and cell that touch
+        """
+        sums = _sums_in_cells(triangles, number, place, unpacked(keys))
+        column = keys // LIMIT
+        above = _sums_above(column, sums[:, :SEEN])
         below = 4 * above[:, :4].reshape(-1, 2, 2)
         above -= sums[:, :SEEN]
         for first in (SEEN, SEEN + 4):
@@ -83,36 +84,9 @@ class Columns:
         moments: Rows = sums[:, -3:].copy()
         moments[:, :2] += above[:, 4:]
         moments[:, 2] += above[:, :4].sum(axis=1) / 12
-        return cls(keys, np.reshape(corners, (-1, 2, 2, 2)), moments, below)
-
-    @property
-    def leak(self) -> float:
-        """Largest winding number below a column: 0 for a closed, consistently wound surface."""
-        lowest = np.diff(self.keys // LIMIT, prepend=-1) != 0
-        return float(np.abs(self.below[lowest]).max(initial=0.0))
-
-    def inside(self, cells: Indices) -> tuple[Rows, Rows]:
-        """Return the fills (k, 2, 2, 2) and second moments (k, 3) of any cells (k, 3)."""
-        if len(self.keys) == 0:
-            return np.zeros((len(cells), 2, 2, 2)), np.zeros((len(cells), 3))
-        keys = packed(cells)
-        place = np.searchsorted(self.keys, keys).clip(max=len(self.keys) - 1)
-        next_cut = self.keys[place]
-        is_above = (next_cut >= keys) & (next_cut // LIMIT == keys // LIMIT)
-        uncut = np.where(is_above[:, None, None], self.below[place], 0.0)
-        is_cut = next_cut == keys
-        fills = np.where(is_cut[:, None, None, None], self.corners[place], uncut[..., None])
-        uncut_moments = uncut.mean(axis=(1, 2))[:, None] / 12
-        return fills, np.where(is_cut[:, None], self.moments[place], uncut_moments)
-
-
-def _sums_of_keys(keys: Indices, values: Rows) -> tuple[Indices, Rows]:
-    """Return the distinct keys (c,), ascending, and the sums (c, k) of their rows (p, k)."""
-    distinct, place = np.unique(keys, return_inverse=True)
-    sums: Rows = np.empty((len(distinct), values.shape[1]))
-    for column, rows in enumerate(values.T):
-        sums[:, column] = np.bincount(place, rows, len(distinct))
-    return distinct, sums
+        lowest = np.diff(column, prepend=-1) != 0
+        leak = float(np.abs(below[lowest]).max(initial=0.0))
+        return cls(np.reshape(corners, (-1, 2, 2, 2)), moments, below, leak)
 
 
 @njit()
@@ -126,42 +100,19 @@ def _sums_above(column: Indices, values: Rows) -> Rows:
 
 
 @njit()
-def _pieces(triangles: Rows, low: Indices, high: Indices) -> tuple[Indices, Rows]:
-    """Cut triangles into pieces by cells.
-
-    returns : cell (p, 3) of each piece, and its sums (p, SUMS) from ``_add_sums``
-    """
-    cells = np.empty((4 * len(triangles) + 16, 3), np.int64)
-    values = np.empty((len(cells), SUMS))
-    used = 0
-    buffers = np.empty((4, 12, 3))
-    work, across, along, piece = buffers[0], buffers[1], buffers[2], buffers[3]
-    for triangle in triangles:
-        i0, i1 = _layers(triangle, 3, 0, low, high)
-        for i in range(i0, i1):
-            n = clip_between(triangle, 3, 0, (float(i), i + 1.0), work, across)
-            j0, j1 = _layers(across, n, 1, low, high)
-            for j in range(j0, j1):
-                m = clip_between(across, n, 1, (float(j), j + 1.0), work, along)
-                k0, k1 = _layers(along, m, 2, low, high)
-                for k in range(k0, k1):
-                    corners = clip_between(along, m, 2, (float(k), k + 1.0), work, piece)
-                    cells, values = grown(cells, used), grown(values, used)
-                    cells[used, 0], cells[used, 1], cells[used, 2] = i, j, k
-                    values[used] = 0.0
-                    for a in range(1, corners - 1):
-                        _add_sums(piece[0], piece[a], piece[a + 1], cells[used], values[used])
-                    used += 1
-    return cells[:used], values[:used]
-
-
-@njit()
-def _layers(polygon: Rows, n: int, axis: int, low: Indices, high: Indices) -> tuple[int, int]:
-    """Return the first cell index of a polygon along an axis, and its last index plus 1."""
-    if n == 0:
-        return 0, 0
-    smallest, largest = extent(polygon, n, axis)
-    return max(int(np.floor(smallest)), low[axis]), min(int(np.floor(largest)) + 1, high[axis])
+def _sums_in_cells(triangles: Rows, number: Indices, place: Indices, cells: Indices) -> Rows:
+    """Return the sums (c, SUMS) of ``_add_sums`` over the pieces of triangles in cells (c, 3)."""
+    sums = np.zeros((len(cells), SUMS))
+    own = np.empty(SUMS)
+    buffers = np.empty((3, 12, 3))
+    for n in range(len(number)):
+        cell = cells[place[n]]
+        piece = clip_to_cell(triangles[number[n]], cell, buffers)
+        own[:] = 0.0
+        for a in range(1, len(piece) - 1):
+            _add_sums(piece[0], piece[a], piece[a + 1], cell, own)
+        sums[place[n]] += own
+    return sums
 
 
 @njit()

@@ -15,7 +15,7 @@ from msmpetsc.backend.arrays import Array, Floats, Indices, Rows
 from msmpetsc.backend.kernel import njit
 from msmpetsc.backend.trees import root
 from msmpetsc.geometry.morton import COPIES
-from msmpetsc.geometry.valid_cells import clip_between, grown
+from msmpetsc.geometry.valid_cells import clip_to_cell, grown
 
 # lines in a row along each axis of a cell [-]; a part 1/8 of a cell wide meets a line
 LINES = 8
@@ -220,18 +220,13 @@ def _ray_inwards(triangles: Rows, t: int) -> tuple[Floats, Floats, float]:
     The ray begins at the middle of the part of the triangle in the cell. Its length is 0 if the
     triangle is not in the cell, or has no area.
     """
-    work, part, other = np.empty((12, 3)), np.empty((12, 3)), np.empty((12, 3))
-    part[:3] = triangles[t]
-    size = 3
-    for axis in range(3):
-        size = clip_between(part, size, axis, (0.0, 1.0), work, other)
-        part[:size] = other[:size]
+    part = clip_to_cell(triangles[t], np.zeros(3, np.int64), np.empty((3, 12, 3)))
     start = np.zeros(3)
-    for n in range(size):
-        start += part[n] / size
+    for point in part:
+        start += point / len(part)
     inwards = -np.cross(triangles[t, 1] - triangles[t, 0], triangles[t, 2] - triangles[t, 0])
     area = np.sqrt((inwards * inwards).sum())
-    if size == 0 or area == 0.0:
+    if len(part) == 0 or area == 0.0:
         return start, inwards, 0.0
     inwards /= area
     length = np.inf

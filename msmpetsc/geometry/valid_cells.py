@@ -59,6 +59,23 @@ def clip_between(
 
 
 @njit()
+def clip_to_cell(triangle: Rows, cell: Indices, buffers: Rows) -> Rows:
+    """Return the corners (n, 3) of the piece of a triangle in a cell (3,).
+
+    buffers : (3, 12, 3) memory of the result
+    """
+    piece, work, out = buffers[0], buffers[1], buffers[2]
+    piece[:3] = triangle
+    size = 3
+    for axis in range(3):
+        planes = (float(cell[axis]), cell[axis] + 1.0)
+        size = clip_between(piece, size, axis, planes, work, out)
+        piece[:size] = out[:size]
+    corners: Rows = piece[:size]
+    return corners
+
+
+@njit()
 def extent(polygon: Rows, n: int, axis: int) -> tuple[float, float]:
     """Return the smallest and largest coordinate of a polygon along an axis."""
     smallest, largest = polygon[0, axis], polygon[0, axis]
@@ -132,12 +149,14 @@ def cells_of_gaps(gaps: Indices) -> Indices:
     return cells
 
 
-def gaps_between(cells: Indices) -> Indices:
-    """Return the gaps (g, 4) between cells (c, 3) of the same column.
+def gaps_between(cells: Indices) -> tuple[Indices, Indices]:
+    """Find the gaps (g, 4) between cells (c, 3) of the same column.
 
-    cells   : in lexicographic order
-    returns : rows (i, j, k first, k last)
+    cells : in lexicographic order
+
+    Return rows (i, j, k first, k last), and the row in ``cells`` of the cell above each gap.
     """
     low, high = cells[:-1], cells[1:]
     has_gap = (low[:, :2] == high[:, :2]).all(axis=1) & (high[:, 2] - low[:, 2] > 1)
-    return np.column_stack([low[has_gap, :2], low[has_gap, 2] + 1, high[has_gap, 2] - 1])
+    gaps = np.column_stack([low[has_gap, :2], low[has_gap, 2] + 1, high[has_gap, 2] - 1])
+    return gaps, 1 + np.flatnonzero(has_gap)

@@ -19,11 +19,13 @@ from mpi4py import MPI
 from msmpetsc.backend.arrays import Indices, Mask, Positions, Rows
 from msmpetsc.comm import log, on_root
 from msmpetsc.errors import InputError, did_you_mean, printable
-from msmpetsc.geometry.cages import BodySurface, Cages, marked_cells
+from msmpetsc.geometry.cages import BodySurface, Cages
 from msmpetsc.geometry.embedding import cells_at
+from msmpetsc.geometry.grid import unpacked
 from msmpetsc.geometry.inside import inside_bodies
 from msmpetsc.geometry.morton import COPIES, encode_morton
 from msmpetsc.geometry.surface import SINGLE, Surface, bounds_of, examine, is_inside
+from msmpetsc.geometry.valid_cells import touched_cells
 from msmpetsc.lattice.cell_samples import COUNT, CellSamples
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.nearest_points import NodePoints, nearest_in_bodies
@@ -195,8 +197,9 @@ class Finder:
             grid = self.cages.grids.grids[number]
             # a node is nearest to the points of the cell centred at the node
             corners = grid.to_cells(surface.points)[surface.triangles] + are_nodes / 2
-            marked = marked_cells(corners, np.zeros(3, np.int64), grid.shape + 1)
-            yield number, surface, encode_morton(marked + self.cages.grids.first(number))
+            touched, _ = touched_cells(corners, np.zeros(3, np.int64), grid.shape + 1)
+            marked = unpacked(np.unique(touched)) + self.cages.grids.first(number)
+            yield number, surface, encode_morton(marked)
 
     def _painted_cells(self, table: OfBody) -> Indices:
         """Return the keys (k,) of cells with painted points of a body's surface (collective)."""

@@ -15,7 +15,7 @@ from msmpetsc.backend.arrays import Array, Indices, Rows
 from msmpetsc.comm import Route, log, on_root
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.cell_parts import CellParts, parts_of
-from msmpetsc.geometry.copies import NO_COPIES, Copies, find_copies
+from msmpetsc.geometry.copies import Copies, find_copies
 from msmpetsc.geometry.fill_fractions import LEAK, Columns, sampled_inside
 from msmpetsc.geometry.grid import CHUNK, CORNERS, BodyGrids, Grid, packed, unpacked
 from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
@@ -60,7 +60,7 @@ class Cages:
                   (geometry.fill_fractions)
     moments     : (n_local, 3) second moments of the material about the cells' middles [cells^5]
     is_weighted : whether boundary cells are weighted by their fill
-    copies      : cells whose corners are not the ordinary nodes; None if all cells are ordinary
+    copies      : cells whose corners are not the ordinary nodes
     parts       : finder of the part of a cell that holds a point, for each body on rank 0; None
                   on other ranks, and for a body without parts
     """
@@ -71,7 +71,7 @@ class Cages:
     fills: Rows
     moments: Rows
     is_weighted: bool
-    copies: Copies | None
+    copies: Copies
     parts: tuple[PartsOfPoints | None, ...]
 
     @property
@@ -86,8 +86,7 @@ class Cages:
 
     def corner_keys(self, keys: Indices) -> Indices:
         """Return the keys (..., 8) of the corner nodes of cells (...,)."""
-        copies = self.copies or NO_COPIES
-        return copies.corner_keys(keys, decode_morton(keys))
+        return self.copies.corner_keys(keys, decode_morton(keys))
 
 
 @dataclass(frozen=True)
@@ -145,9 +144,9 @@ def fill(
     return Cages(grids, table, kind, fills, moments, is_weighted, copies, points)
 
 
-def _log_copies(copies: Copies | None) -> None:
+def _log_copies(copies: Copies) -> None:
     """Log the number of copies of cells and of nodes, if any."""
-    if copies:
+    if len(copies.keys):
         cells = int((copies.keys % COPIES > 0).sum())
         nodes = np.unique(copies.corners)
         log.info(

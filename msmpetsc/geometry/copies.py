@@ -79,13 +79,8 @@ class Copies:
         return np.isin(keys - keys % COPIES, places)
 
 
-NO_COPIES = Copies(np.empty(0, np.int64), np.empty((0, 8), np.int64))
-
-
-def find_copies(
-    bodies: Sequence[CellParts | None], grids: BodyGrids, table: SortedKeys
-) -> Copies | None:
-    """Return the cells of all bodies that are not ordinary; None if there are none (collective).
+def find_copies(bodies: Sequence[CellParts | None], grids: BodyGrids, table: SortedKeys) -> Copies:
+    """Return the cells of all bodies that are not ordinary (collective).
 
     bodies : parts of each body's cells on rank 0; None on other ranks, and for a body without parts
     table  : keys of all valid cells
@@ -97,9 +92,8 @@ def find_copies(
     ordinary = encode_morton(decode_morton(keys)[:, None] + CORNERS)
     own = np.flatnonzero((corners != ordinary).any(axis=1) | (keys % COPIES > 0))
     own = own[np.argsort(keys[own])]
-    copies = Copies(keys[own], corners[own]) if len(own) else None
-    shared: Copies | None = table.comm.bcast(copies)
-    return shared
+    copies: Copies = table.comm.bcast(Copies(keys[own], corners[own]))
+    return copies
 
 
 def _copies_of_body(

@@ -102,11 +102,9 @@ def _around(cages: Cages, keys: Indices) -> tuple[Mask, Indices]:
     cells = encode_morton(around + CELLS_AROUND)
     neighbours = cages.table.find(cells) >= 0
     node_keys = encode_morton(around + NODES_AROUND)
-    if cages.copies is None:
-        return neighbours, node_keys
-    copies = cells[:, :, None] + np.arange(COPIES)
-    rows = np.flatnonzero((cages.copies.place(copies) >= 0).any(axis=(1, 2)))
-    copies = copies[rows]
+    ordinary = cages.copies.keys - cages.copies.keys % COPIES
+    rows = np.flatnonzero(np.isin(cells, ordinary).any(axis=1))
+    copies = cells[rows, :, None] + np.arange(COPIES)
     own, corners = cages.corner_keys(keys[rows]), cages.corner_keys(copies)
     joined = (corners[..., None] == own[:, None, None, None, :]).any(axis=(3, 4))
     joined &= cages.table.find(copies) >= 0

@@ -16,7 +16,6 @@ from mpi4py import MPI
 from msmpetsc.backend.arrays import Array, Floats, Indices, Mask, Positions, to_host
 from msmpetsc.comm import starts
 from msmpetsc.geometry.cages import Cages
-from msmpetsc.geometry.copies import Copies
 from msmpetsc.geometry.partition import SortedKeys
 from msmpetsc.lattice.mass_and_stiffness import (
     SolidCells,
@@ -80,7 +79,6 @@ class Lattice:
     cell_stiffness : (d,) stiffness of an edge spring inside a body of the cell's material [N/m]
     cell_fill   : (c,) fraction of each of ``cells`` that lies inside the surface [-]
     first_of_body : (b,) global number of each body's first node; a body's numbers are consecutive
-    copies      : cells and nodes with copies (geometry.copies); None if there are none
     solid       : constants of a neo-Hookean solid; None if the law is springs
     volumetric  : name of a solid's volumetric energy (elasticity.neo_hookean)
     viscous     : beta / tau [-], viscosity of a step over the stiffness (elasticity.viscosity)
@@ -105,7 +103,6 @@ class Lattice:
     cell_stiffness: Floats = field(default_factory=lambda: np.empty(0))
     cell_fill: Floats = field(default_factory=lambda: np.empty(0))
     first_of_body: Indices = field(default_factory=lambda: np.zeros(1, np.int64))
-    copies: Copies | None = None
     solid: SolidCells | None = None
     volumetric: str = "quadratic"
     viscous: float = 0.0
@@ -225,7 +222,6 @@ def build_lattice(
         local_cells=net.cells[kept],
         cells_owned=int(first_owned.sum()),
         cell_stiffness=law.cells[kept],
-        copies=cages.copies,
         first_of_body=starts(net.table.comm.allreduce(nodes_of_bodies)),
         solid=law.solid and SolidCells(*(rows[kept] for rows in law.solid)),
         volumetric=material.volume,

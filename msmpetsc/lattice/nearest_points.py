@@ -37,20 +37,18 @@ def nearest_of_body(bodies: Sequence[BodySurface], cages: Cages, topology: Topol
 
     A node at a slit narrower than a cell has the nearest point of its own side.
     """
-    owned = topology.ijk[: len(topology.octants)]
+    owned, keys = topology.ijk[: len(topology.octants)], topology.table.keys
     body = cages.grids.body_of(owned)
     # a node of eight valid cells is inside, or in a narrow fold of the surface
-    is_within = topology.octants.all(axis=1) & (topology.table.keys % COPIES == 0)
+    is_within = topology.octants.all(axis=1) & (keys % COPIES == 0)
     rows = np.flatnonzero(~is_within & cages.is_weighted)
     nearest = cages.grids.node_positions(owned)
     nearest[rows] = nearest_in_bodies(bodies, nearest[rows], body[rows])
     of_part = np.zeros(len(nearest), bool)
-    if cages.copies:
-        keys = topology.table.keys
-        rows = np.flatnonzero(cages.copies.suspects(keys))
-        in_parts = nearest_in_parts(bodies, cages, keys[rows])
-        of_part[rows] = ~np.isnan(in_parts[:, 0])
-        nearest[of_part] = in_parts[of_part[rows]]
+    rows = np.flatnonzero(cages.copies.suspects(keys))
+    in_parts = nearest_in_parts(bodies, cages, keys[rows])
+    of_part[rows] = ~np.isnan(in_parts[:, 0])
+    nearest[of_part] = in_parts[of_part[rows]]
     return NodePoints(
         *(topology.table.with_ghosts(topology.ghosts, rows) for rows in (nearest, of_part))
     )
@@ -87,7 +85,6 @@ def nearest_in_parts(bodies: Sequence[BodySurface], cages: Cages, keys: Indices)
 
     keys : (n,) keys of the nodes
     """
-    assert cages.copies is not None
     ijk = decode_morton(keys)
     body, cells = cages.grids.body_of(ijk), ijk[:, None] + OCTANTS
     part = cages.copies.parts_at_nodes(cages.table, keys)

@@ -95,8 +95,6 @@ def _cells_around(cages: Cages, table: SortedKeys) -> tuple[Indices, Mask]:
     """
     around = encode_morton(decode_morton(table.keys)[:, None, :] - CORNERS)
     octants = cages.table.find(around) >= 0
-    if cages.copies is None:
-        return np.unique(around[octants]), octants
     is_ordinary = cages.copies.place(around) < 0
     octants &= is_ordinary & (table.keys % COPIES == 0)[:, None]
     keys = around[octants]

@@ -7,6 +7,7 @@ from mpi4py import MPI
 
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.geometry.cages import Cages
+from msmpetsc.geometry.copies import Copies
 from msmpetsc.geometry.grid import BodyGrids, Grid
 from msmpetsc.geometry.morton import encode_morton
 from msmpetsc.geometry.partition import SortedKeys
@@ -20,6 +21,7 @@ E, H, DENSITY = 3e4, 0.2, 800.0
 T = 1 / 60
 GRAVITY = np.array([0, 0, -9.81])
 COMM = MPI.COMM_SELF
+NO_COPIES = Copies(np.empty(0, np.int64), np.empty((0, 8), np.int64))
 ORIGIN = np.array([1.0, -2.0, 3.0])
 
 
@@ -30,7 +32,7 @@ def cages_of(cells: np.ndarray, cell_size: float = H, comm: MPI.Comm = COMM) -> 
     count = len(table.keys)
     return Cages(
         BodyGrids((grid,)), table, np.ones(count, np.uint8), np.ones((count, 2, 2, 2)),
-        np.full((count, 3), 1 / 12), is_weighted=False, copies=None, parts=(None,),
+        np.full((count, 3), 1 / 12), is_weighted=False, copies=NO_COPIES, parts=(None,),
     )  # fmt: skip
 
 

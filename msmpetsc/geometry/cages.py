@@ -23,7 +23,7 @@ from msmpetsc.geometry.partition import SortedKeys, places_of, ranges
 from msmpetsc.geometry.parts_of_points import PartsOfPoints
 from msmpetsc.geometry.surface import Surface, SurfaceReport, is_inside
 from msmpetsc.geometry.thickness import Thickness
-from msmpetsc.geometry.valid_cells import cells_of_gaps, gaps_between, touched_cells
+from msmpetsc.geometry.valid_cells import cells_below, touched_cells
 
 BOUNDARY, INTERIOR = 1, 2
 # least fill of a corner [-]; gives a corner far from the inside some mass
@@ -94,18 +94,17 @@ class SlabCells:
     """Valid cells in a rank's slab of a grid. The axes are cycled, so that the longest is first.
 
     boundary : (b, 3) cells that the surface touches
-    gaps     : (g, 4) interior cells as gaps (geometry.valid_cells)
+    interior : (n, 3) cells that the surface encloses
     columns  : fill of the boundary cells; None if the surface is open or wound inconsistently
     """
 
     boundary: Indices
-    gaps: Indices
+    interior: Indices
     columns: Columns | None
 
     def count(self, comm: MPI.Comm) -> int:
         """Return the number of valid cells on all ranks (collective)."""
-        interior = (self.gaps[:, 3] - self.gaps[:, 2] + 1).sum()
-        return int(comm.allreduce(len(self.boundary) + interior))
+        return int(comm.allreduce(len(self.boundary) + len(self.interior)))
 
 
 def fill(
@@ -218,9 +217,8 @@ def _cells_of(
 ) -> tuple[Indices, Array, Rows, Rows]:
     """Return grid index (n, 3), kind, fills and second moments of a rank's cells (collective)."""
     axes, count = np.argsort(_axes(body)), len(cells.boundary)
-    interior = cells_of_gaps(cells.gaps)
-    ijk = np.concatenate([cells.boundary, interior])[:, axes]
-    kind = np.repeat(np.array([BOUNDARY, INTERIOR], np.uint8), [count, len(interior)])
+    ijk = np.concatenate([cells.boundary, cells.interior])[:, axes]
+    kind = np.repeat(np.array([BOUNDARY, INTERIOR], np.uint8), [count, len(ijk) - count])
     fills, moments = np.ones((len(ijk), 2, 2, 2)), np.full((len(ijk), 3), 1 / 12)
     if is_weighted and cells.columns:
         cut = cells.columns.corners.transpose(0, *(1 + axes)), cells.columns.moments[:, axes]
@@ -304,10 +302,10 @@ def _slab_cells(body: BodySurface, grid: Grid) -> SlabCells:
         outwards = corners if body.report.volume > 0 else corners[:, ::-1]
         columns = Columns.crossed(outwards, number, place, keys)
         if body.comm.allreduce(columns.leak, MPI.MAX) < LEAK:
-            gaps, above = gaps_between(touched)
             # winding numbers are 1 inside and 0 outside
-            return SlabCells(touched, gaps[columns.below[above, 0, 0] > 0.5], columns)
-    return SlabCells(touched, _gaps_by_winding(body, grid, axes, edges, touched), None)
+            is_inside_body = columns.below[:, 0, 0] > 0.5
+            return SlabCells(touched, cells_below(touched, is_inside_body), columns)
+    return SlabCells(touched, _interior_by_winding(body, grid, axes, edges, touched), None)
 
 
 def _axes(body: BodySurface) -> Indices:
@@ -336,10 +334,10 @@ def _slab_triangles(body: BodySurface, grid: Grid, axes: Indices, edges: Indices
     return Route(body.comm, ranges(first, copies)).send(np.repeat(corners, copies, axis=0))
 
 
-def _gaps_by_winding(
+def _interior_by_winding(
     body: BodySurface, grid: Grid, axes: Indices, edges: Indices, boundary: Indices
 ) -> Indices:
-    """Return the interior cells (g, 4) of a slab, by the winding numbers of their centres.
+    """Return the interior cells (n, 3) of a slab, by the winding numbers of their centres.
 
     The time grows with the bounding box; the memory does not. Every rank gets the whole surface
     (collective). Source: Jacobson et al. 2013.
@@ -348,7 +346,7 @@ def _gaps_by_winding(
     shape = grid.shape[axes]
     marked = packed(boundary)
     first, last = edges[body.comm.rank : body.comm.rank + 2] * shape[1] * shape[2]
-    gaps = [np.empty((0, 4), np.int64)]
+    interior = [np.empty((0, 3), np.int64)]
     for start in range(first, last, CHUNK):
         cells = np.stack(
             np.unravel_index(np.arange(start, min(start + CHUNK, last)), shape), axis=1
@@ -356,7 +354,5 @@ def _gaps_by_winding(
         cells = cells[~np.isin(packed(cells), marked)]
         centres = np.empty(cells.shape)
         centres[:, axes] = cells + 0.5
-        inside = cells[is_inside(surface, grid.node_positions(centres))]
-        # each cell is a gap of length 1
-        gaps.append(inside[:, [0, 1, 2, 2]])
-    return np.concatenate(gaps)
+        interior.append(cells[is_inside(surface, grid.node_positions(centres))])
+    return np.concatenate(interior)

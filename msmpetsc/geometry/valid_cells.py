@@ -4,13 +4,13 @@ All lengths are in cells: cell (i, j, k) is the box [i, i+1) x [j, j+1) x [k, k+
 low faces, so a face of the body in a grid plane marks a single layer of cells.
 
 The boundary cells of a column (i, j) leave gaps between them, and each gap is inside or outside as
-a whole. So the memory grows with the boundary, not with the bounding box. Each rank has a slab of
-planes i.
+a whole. So the memory grows with the valid cells, not with the bounding box. Each rank has a slab
+of planes i.
 """
 
 import numpy as np
 
-from msmpetsc.backend.arrays import Array, Indices, Rows
+from msmpetsc.backend.arrays import Array, Indices, Mask, Rows
 from msmpetsc.backend.kernel import njit
 from msmpetsc.geometry.grid import PACK
 from msmpetsc.geometry.partition import ranges
@@ -141,22 +141,15 @@ def touched_cells(corners: Rows, low: Indices, high: Indices) -> tuple[Indices, 
     return touching[:used, 0].copy(), touching[:used, 1].copy()
 
 
-def cells_of_gaps(gaps: Indices) -> Indices:
-    """Return the cells (c, 3) int64 of gaps (i, j, k first, k last)."""
-    length = gaps[:, 3] - gaps[:, 2] + 1
-    cells = np.repeat(gaps[:, :3], length, axis=0)
-    cells[:, 2] = ranges(gaps[:, 2], length)
-    return cells
+def cells_below(cells: Indices, is_inside: Mask) -> Indices:
+    """Return the cells (n, 3) in the gaps of columns (i, j), below those cells that are marked.
 
-
-def gaps_between(cells: Indices) -> tuple[Indices, Indices]:
-    """Find the gaps (g, 4) between cells (c, 3) of the same column.
-
-    cells : in lexicographic order
-
-    Return rows (i, j, k first, k last), and the row in ``cells`` of the cell above each gap.
+    cells     : (c, 3), in lexicographic order
+    is_inside : (c,) whether the gap below each cell, down to the next cell, is inside the body
     """
     low, high = cells[:-1], cells[1:]
-    has_gap = (low[:, :2] == high[:, :2]).all(axis=1) & (high[:, 2] - low[:, 2] > 1)
-    gaps = np.column_stack([low[has_gap, :2], low[has_gap, 2] + 1, high[has_gap, 2] - 1])
-    return gaps, 1 + np.flatnonzero(has_gap)
+    above = (low[:, :2] == high[:, :2]).all(axis=1) & is_inside[1:]
+    length = (high - low)[above, 2] - 1
+    between = np.repeat(low[above], length, axis=0)
+    between[:, 2] = ranges(low[above, 2] + 1, length)
+    return between

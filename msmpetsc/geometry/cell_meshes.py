@@ -200,10 +200,10 @@ def boundary(points: Positions, blocks: MeshBlocks) -> Indices:
         np.zeros((0, 4), np.int64),
         *(_key(cells[:, [*map(int, face)]]) for face, _, cells, _ in faces),
     ]
-    ordered = np.concatenate(keys)[order := np.lexsort(np.concatenate(keys).T)]
-    shared = (ordered[1:] == ordered[:-1]).all(axis=1)
-    outer = np.ones(len(order), bool)
-    outer[order[1:][shared]] = outer[order[:-1][shared]] = False
+    _, place, uses = np.unique(
+        np.concatenate(keys), axis=0, return_inverse=True, return_counts=True
+    )
+    outer = uses[place.ravel()] == 1
     parts = [np.zeros((0, 3), np.int64)]
     ends = np.cumsum([len(key) for key in keys])
     for (face, kind, cells, inverted), is_outer in zip(

@@ -178,14 +178,10 @@ def have_three_corners(triangles: Indices) -> Mask:
 
 def first_of_equal(points: Positions) -> Indices:
     """Return, for each point (v,), the lowest number of a point at exactly the same position."""
-    # a stable sort, so that equal points keep the order of their numbers
-    order = np.lexsort(points.T)
-    sorted_points = points[order]
-    starts = np.ones(len(points), bool)
-    starts[1:] = (sorted_points[1:] != sorted_points[:-1]).any(axis=1)
-    first = np.empty(len(points), np.int64)
-    first[order] = order[starts][np.cumsum(starts) - 1]
-    return first
+    _, first, place = np.unique(points, axis=0, return_index=True, return_inverse=True)
+    # some versions of NumPy return places (v, 1)
+    lowest: Indices = first[place.ravel()]
+    return lowest
 
 
 def edge_use(triangles: Indices) -> tuple[Indices, Indices]:
@@ -193,11 +189,7 @@ def edge_use(triangles: Indices) -> tuple[Indices, Indices]:
 
     An upward triangle has the edge from the lower to the higher point number.
     """
-    if len(triangles) == 0:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
     start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
-    low, high = np.minimum(start, end), np.maximum(start, end)
-    # a sortable number for each edge, its direction in the last bit
-    key = np.sort((low * (triangles.max() + 1) + high) * 2 + (start < end))
-    first = np.flatnonzero(np.diff(key >> 1, prepend=-1))
-    return np.diff(first, append=len(key)), np.add.reduceat(key & 1, first)
+    edge = np.minimum(start, end) * (triangles.max(initial=0) + 1) + np.maximum(start, end)
+    _, place, used = np.unique(edge, return_inverse=True, return_counts=True)
+    return used, np.bincount(place[start < end], minlength=len(used))

@@ -9,7 +9,7 @@ from msmpetsc.errors import InputError
 from msmpetsc.geometry.cages import BodySurface, Cages
 from msmpetsc.geometry.embedding import cells_at, embed
 from msmpetsc.geometry.grid import MOST_ON_PLANE
-from msmpetsc.lattice.embedded_surface import EmbeddedPoints
+from msmpetsc.lattice.embedded_surface import EmbeddedPoints, doubled_areas
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.region import groups_named
 from msmpetsc.scene.schema import Probe
@@ -33,9 +33,7 @@ def probe_points(bodies: Sequence[BodySurface], probes: Sequence[Probe]) -> list
 
         group = next(iter(groups_named(bodies, f"output.probe.{number}", probe.group).values()))
         corners = group.points[group.triangles]
-        areas = np.linalg.norm(
-            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
-        )
+        areas = np.linalg.norm(doubled_areas(corners.swapaxes(0, 1)), axis=1)
         middle = np.average(corners.mean(axis=1), axis=0, weights=areas)
         points.append(
             igl.point_mesh_squared_distance(middle[None], group.points, group.triangles)[2][0]

@@ -11,8 +11,7 @@ With a single material w is 1. If one of two materials has no stiffness, the cel
 that the surface cuts (lattice.cut_cells, lattice.cell_moments).
 """
 
-from collections.abc import Iterable, Iterator, Sequence
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -22,16 +21,6 @@ from msmpetsc.lattice.material import CellMaterial, MaterialOfCells, MixedCells
 from msmpetsc.lattice.region import Finder
 from msmpetsc.scene.body import Material, OwnMaterial
 from msmpetsc.scene.schema import OfBody
-
-
-class Constant(NamedTuple):
-    """A material constant of cells (c,), and of the samples (k, s) of cells that are cut.
-
-    An interface between materials cuts these cells.
-    """
-
-    of_cells: Floats
-    of_samples: Rows
 
 
 def cell_materials(
@@ -66,47 +55,43 @@ def cell_materials(
         for part, mask in zip(parts, masks, strict=True):
             mask[cut] &= shares > 0
             finder.check_holds(part, mask)
-        density, spring, poisson = (
-            _means([*_own_values(parts, masks, name)], of_body[cells.body], cut, shares)
+        (density, _), (stiffness, of_samples), (poisson, _) = (
+            _means([getattr(x.table, name) for x in parts], masks, of_body[cells.body], cut, shares)
             for name, of_body in zip(names, of_bodies, strict=True)
         )
-        weights = shares * (spring.of_samples / spring.of_cells[cut, None] - 1)
+        weights = shares * (of_samples / stiffness[cut, None] - 1)
         rows = np.flatnonzero(weights.any(axis=1))
         weighted = cells.weighted(cut[rows], weights[rows])
-        return CellMaterial(
-            density.of_cells, spring.of_cells, poisson.of_cells, MixedCells(cut[rows], *weighted)
-        )
+        return CellMaterial(density, stiffness, poisson, MixedCells(cut[rows], *weighted))
 
     return of_cells
 
 
 def _means(
-    own_values: Sequence[tuple[float, Mask]], of_cells: Floats, cut: Indices, shares: Rows
-) -> Constant:
-    """Return a constant of cells; a cell among ``cut`` (k,) has the mean over its samples.
+    values: Sequence[float | None],
+    masks: Sequence[Mask],
+    of_cells: Floats,
+    cut: Indices,
+    shares: Rows,
+) -> tuple[Floats, Rows]:
+    """Return a constant of cells (c,), and of the samples (k, s) of the cells ``cut`` (k,).
 
-    own_values : values of parts and the masks (c, s) of their samples; the last part takes effect
-    of_cells   : (c,) value outside the parts; changed to the result
-    shares     : (k, s) share of each sample in the cells ``cut``
+    A cell that an interface between materials cuts has the mean over its samples.
+
+    values   : value of each part, None if the part gives none; the last part takes effect
+    masks    : mask (c, s) of each part's samples
+    of_cells : (c,) value outside the parts; changed to the result
+    shares   : (k, s) share of each sample in the cells ``cut``
     """
     of_samples = np.repeat(of_cells[cut, None], COUNT, axis=1)
-    for value, mask in own_values:
-        of_cells[mask.all(axis=1)] = value
-        of_samples[mask[cut]] = value
+    for value, mask in zip(values, masks, strict=True):
+        if value is not None:
+            of_cells[mask.all(axis=1)] = value
+            of_samples[mask[cut]] = value
     # relative to a sample inside, so that equal samples give exactly their value
     first = np.take_along_axis(of_samples, shares.argmax(axis=1)[:, None], axis=1)
     of_cells[cut] = first[:, 0] + (shares * (of_samples - first)).sum(axis=1)
-    return Constant(of_cells, of_samples)
-
-
-def _own_values(
-    parts: Sequence[OfBody], masks: Sequence[Mask], name: str
-) -> Iterator[tuple[float, Mask]]:
-    """Yield the value and the mask (c, s) of each part that gives a constant."""
-    for part, mask in zip(parts, masks, strict=True):
-        value = getattr(part.table, name)
-        if value is not None:
-            yield value, mask
+    return of_cells, of_samples
 
 
 def _own(own: OwnMaterial | None, material: Material, name: str) -> float:

@@ -142,22 +142,33 @@ class ActingForces:
         self.all: list[Varying] = [*loads, *own_forces, *pressures]
         self._own = [np.zeros((0, 3))] * len(own_forces)
 
-    def begin_step(self, q: Positions, v: Rows, time: float) -> None:
+    def begin_step(
+        self,
+        q: Positions,
+        v: Rows,
+        time: float,
+        earlier: tuple[Positions, Rows, float] | None = None,
+    ) -> None:
         """Evaluate the users' force functions at the state at which a step begins.
 
-        The forces stay constant within the step. So they are explicit, and with any integrator
-        their error is of first order in the time step.
+        The forces stay constant within the step. So they are explicit, and their error is of first
+        order in the time step. With a state one step earlier they are extrapolated to the end of
+        the step, and the error is of second order.
 
-        q, v : positions (l, 3) [m] and velocities (l, 3) [m/s]
-        time : begin of the step [s]
+        q, v    : positions (l, 3) [m] and velocities (l, 3) [m/s]
+        time    : begin of the step [s]
+        earlier : positions, velocities and time one step earlier
 
         Raises InputError if the result of a function has a wrong shape or is not finite.
         """
         owned = self.lattice.owned
+
+        def own(force: OwnForce, q: Positions, v: Rows, time: float) -> Rows:
+            return like(q, force.force_at(to_host(q[:owned]), to_host(v[:owned]), time))
+
         for number, force in enumerate(self.own_forces):
-            self._own[number] = like(
-                q, force.force_at(to_host(q[:owned]), to_host(v[:owned]), time)
-            )
+            now = own(force, q, v, time)
+            self._own[number] = now if earlier is None else 2 * now - own(force, *earlier)
 
     def at(self, time: float, users: bool = True) -> ExternalForces:
         """Return the external forces at a time [s].

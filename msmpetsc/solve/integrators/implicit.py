@@ -323,7 +323,8 @@ class Bdf2(ImplicitEuler):
 
         f_ext = (3 f_(n+1) - f_n) / 2.
 
-    Friction extrapolates the normal forces of the last two states.
+    Friction extrapolates the normal forces of the last two states, and a user's force function is
+    extrapolated likewise.
     """
 
     TAU_PER_STEP = 2 / 3
@@ -339,12 +340,14 @@ class Bdf2(ImplicitEuler):
         self._let_go(time)
         q, v, work_before = state.q, state.velocity(self.time_step), Work()
         begin, forces = time - self.time_step, self.environment.forces
-        forces.begin_step(q, v, begin)
         history, begun_error = state.history, 0.0
         if history is None:
+            forces.begin_step(q, v, begin)
             load = forces.mean(begin, time)
             history, v, begun_error, work_before = self._history(state, load, time)
-        else:
+        forces.begin_step(q, v, begin, (*history, max(begin - self.time_step, 0.0)))
+        load = forces.mean(begin, time)
+        if state.history:
             load = forces.ahead(begin - (state.span or self.time_step), begin, time)
         q_0, v_0 = history
         carried = carried_time(self.tau, self.damping)

@@ -61,7 +61,7 @@ def _write(comm: MPI.Intracomm, plan: "RunPlan", model: "Model", modes: "Modes")
         file.start_frames(1 + len(modes.shapes), model.lattice.owned, rows)
         frame = Frame(0, 0.0, modes.position, None, 0.0, 0, 0, 0.0, 0.0, 0.0, 0.0, np.zeros(3), 0.0)
         for index, shape in enumerate([np.zeros_like(modes.position), *modes.shapes]):
-            largest = max(comm.allgather(float(np.abs(shape).max(initial=0.0))))
+            largest = max(comm.allgather(float(np.linalg.norm(shape, axis=1).max(initial=0.0))))
             scale = AMPLITUDE * side / largest if largest else 0.0
             q = modes.position + scale * shape
             surface = surface_at(q) if surface_at else None

@@ -102,7 +102,7 @@ def warn_of_thin_bodies(bodies: Sequence[BodySurface], cell_size: float, law: st
 
 
 def _next_guess(excess: dict[float, float], nearest: float) -> float:
-    """Return the root of the secant through the two best sizes, or else the bracket's middle."""
+    """Return the root of the secant through the two best sizes, or else a size in the bracket."""
     # slope of the first step: between -2 for a shell and -3 for a solid
     slope = -2.5
     if len(excess) > 1:
@@ -116,4 +116,8 @@ def _next_guess(excess: dict[float, float], nearest: float) -> float:
     high = min((size for size in excess if excess[size] < 0), default=np.inf)
     if low < guess < high and guess not in excess:
         return guess
-    return (low + high) / 2 if np.isfinite(low + high) else guess
+    if np.isfinite(low + high):
+        return (low + high) / 2
+    # all sizes are on one side of the root: go beyond the outermost
+    outermost = high if np.isfinite(high) else low
+    return outermost - excess[outermost] / slope

@@ -292,6 +292,12 @@ def test_the_cell_size_gives_the_wanted_number_of_cells(name, count):
     assert len(np.unique(cages.table.keys // COPIES)) == pytest.approx(count, rel=0.01)
 
 
+@pytest.mark.parametrize("count", [4, 5, 28, 32])
+def test_a_bar_gets_each_number_that_it_can_have(count):
+    bar = body_of(trimesh.creation.box((1, 0.2, 0.2)))
+    assert fill([bar], choose_cell_size([bar], count)).table.total == count
+
+
 def test_a_number_that_no_size_gives_is_told_and_the_nearest_taken(caplog):
     # a cube has its own k^3 cells and no other number; 20 lies between 8 and 27
     cube = body_of(trimesh.creation.box((1, 1, 1)))

@@ -160,6 +160,8 @@ class Monitors:
             remedy = "a smaller time.step or a smaller solver.error helps to keep them as they were"
             if self.lattice.solid is None:
                 remedy = 'springs cannot turn them back, material.law = "neo-hookean" can'
+            elif not index:
+                remedy = "[start] puts them so, and a solid can turn them back"
             are = "s are" if count > 1 else " is"
             self._warn(index, time, f"{count} cell{are} inside out, the worst {worst}; {remedy}")
         self.frames += count > 0

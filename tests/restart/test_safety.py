@@ -119,6 +119,11 @@ def test_inverted_cells_are_counted_and_told_with_their_place(
     )
     assert first.startswith("frame 0 ") and "32 cells" in first and "neo-hookean" in first
     assert "in 7 frames" in last
+    caplog.clear()
+    solid = {"young_modulus": 1e5, "density": 1e3, "law": "neo-hookean"}
+    play(block_scene(tmp_path, time=TIME, start={"scale": [-1.0, 1.0, 1.0]}, material=solid))
+    # no step has turned the cells
+    assert "[start] puts them so" in caplog.text and "time.step" not in caplog.text
 
 
 def test_only_the_cell_that_is_turned_is_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture):

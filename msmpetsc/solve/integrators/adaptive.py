@@ -215,6 +215,8 @@ class Adaptive(Integrator):
     integrator : integrator of the last step, of the level ``made``; None before the first step
     tick       : time of the state in ticks (Ticks)
     last       : level of the last accepted step
+    coming     : least mean square [m^2] of the displacement until the next frame, as trials of the
+                 present step predict it
     """
 
     uses_history = True
@@ -240,6 +242,7 @@ class Adaptive(Integrator):
         self.ticks = Ticks(self.time_step, steps, self.levels[0], self.environment.events())
         self.integrator: Integrator | None = None
         self.tick = self.last = self.made = 0
+        self.coming = math.inf
         self.mass = reduced(self.comm, float(self.lattice.mass.sum()))
 
     def set_up(self) -> None:
@@ -303,7 +306,7 @@ class Adaptive(Integrator):
     def _step(self, state: State) -> tuple[StepResult, State]:
         """Take the next step; repeat it shorter if its error is too large. Raises StepFailed."""
         restarts = self.tick in self.ticks.events
-        cost = Work()
+        cost, self.coming = Work(), math.inf
         while True:
             longest = self.control.level
             # The history supports steps at most twice as long.
@@ -359,9 +362,9 @@ class Adaptive(Integrator):
             mass @ ((x - self.lattice.nodes[owned]) ** 2).sum(axis=1),
         ]
         # At rest, the size of the motion is the displacement until the next frame.
-        coming = t * v
-        if not self.control.motion:
-            coming = self.time_step * w + 0.5 * self.time_step**2 / t * (w - v)
+        # The start shows the size of the motion of displaced nodes.
+        is_at_rest = (before.q[owned] == self.lattice.nodes[owned]).all(axis=1)[:, None]
+        coming = is_at_rest * (self.time_step * w + 0.5 * self.time_step**2 / t * (w - v))
         # An impact or a change of contact force may come at any time within the step.
         late = t * (mass @ np.sqrt((free * struck**2).sum(axis=1)))
         if self.environment.obstacles.penalties:
@@ -374,7 +377,10 @@ class Adaptive(Integrator):
         error, motion, coming, late = means
         late += result.begun_error / math.sqrt(self.mass)
         if not self.control.motion:
-            motion = max(motion, coming)
+            # Vibrations between frames make ``coming`` too large. The step's longest
+            # trial, an implicit step, limits it.
+            self.coming = min(self.coming, coming)
+            motion = max(motion, self.coming)
         return Measure(math.sqrt(error) + late, math.sqrt(motion))
 
     def _accepted(

@@ -346,9 +346,8 @@ class Bdf2(ImplicitEuler):
             load = forces.mean(begin, time)
             history, v, begun_error, work_before = self._history(state, load, time)
         forces.begin_step(q, v, begin, (*history, max(begin - self.time_step, 0.0)))
-        load = forces.mean(begin, time)
-        if state.history:
-            load = forces.ahead(begin - (state.span or self.time_step), begin, time)
+        before_last = begin - (state.span or self.time_step)
+        load = forces.ahead(before_last, begin, time) if state.history else forces.mean(begin, time)
         q_0, v_0 = history
         carried = carried_time(self.tau, self.damping)
         y = (4 * q - q_0 + carried * (4 * v - v_0)) / 3

@@ -76,16 +76,18 @@ class Frame:
     ]
     surface: Annotated[
         Positions | None, Field("f8", ("T", "v", 3), "m", "surface points", "surface/points")
-    ]
-    step_error: Annotated[float, _number("f8", "1", "estimated relative error of a step")]
-    iterations: Annotated[int, _number("i8", "1", "outer iterations")]
-    ksp_its: Annotated[int, _number("i8", "1", "iterations of the linear solver")]
-    kinetic: Annotated[float, _number("f8", "J", "kinetic energy")]
-    elastic: Annotated[float, _number("f8", "J", "elastic energy")]
-    potential: Annotated[float, _number("f8", "J", "energy in gravity and forces")]
-    contact: Annotated[float, _number("f8", "J", "contact energy of obstacles")]
-    momentum: Annotated[Floats, Field("f8", ("T", 3), "kg m/s", "momentum")]
-    wall_time: Annotated[float, _number("f8", "s", "computing time")]
+    ] = None
+    step_error: Annotated[float, _number("f8", "1", "estimated relative error of a step")] = 0.0
+    iterations: Annotated[int, _number("i8", "1", "outer iterations")] = 0
+    ksp_its: Annotated[int, _number("i8", "1", "iterations of the linear solver")] = 0
+    kinetic: Annotated[float, _number("f8", "J", "kinetic energy")] = 0.0
+    elastic: Annotated[float, _number("f8", "J", "elastic energy")] = 0.0
+    potential: Annotated[float, _number("f8", "J", "energy in gravity and forces")] = 0.0
+    contact: Annotated[float, _number("f8", "J", "contact energy of obstacles")] = 0.0
+    momentum: Annotated[Floats, Field("f8", ("T", 3), "kg m/s", "momentum")] = field(
+        default_factory=lambda: np.zeros(3)
+    )
+    wall_time: Annotated[float, _number("f8", "s", "computing time")] = 0.0
     true_error: Annotated[
         float, _number("f8", "1", "true relative error of a step, in position")
     ] = math.nan

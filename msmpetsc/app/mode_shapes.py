@@ -1,6 +1,5 @@
 """``msmpetsc modes``: natural frequencies and mode shapes, and a result file of the shapes."""
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -59,11 +58,10 @@ def _write(comm: MPI.Intracomm, plan: "RunPlan", model: "Model", modes: "Modes")
         write_model(comm, file, model)
         rows = {} if surface_at is None else {"surface": surface_at.weights.shape[0]}
         file.start_frames(1 + len(modes.shapes), model.lattice.owned, rows)
-        frame = Frame(0, 0.0, modes.position, None, 0.0, 0, 0, 0.0, 0.0, 0.0, 0.0, np.zeros(3), 0.0)
         for index, shape in enumerate([np.zeros_like(modes.position), *modes.shapes]):
             largest = max(comm.allgather(float(np.linalg.norm(shape, axis=1).max(initial=0.0))))
             scale = AMPLITUDE * side / largest if largest else 0.0
             q = modes.position + scale * shape
             surface = surface_at(q) if surface_at else None
-            file.append(replace(frame, index=index, time=index, position=q, surface=surface))
+            file.append(Frame(index, index, q, surface))
     write_companions(comm, plan.request, whole=False)

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -16,10 +15,6 @@ from msmpetsc.geometry.inside import inside_bodies
 from msmpetsc.geometry.surface import Surface, compact
 from msmpetsc.results.reader import Result
 from msmpetsc.scene.schema import OfBody, SceneFile
-
-if TYPE_CHECKING:
-    from msmpetsc.build import Model
-    from msmpetsc.scene.reading import Scene
 
 # largest coordinate that can be drawn [m]; VTK squares coordinates in single precision
 FARTHEST = 1e15
@@ -150,13 +145,15 @@ class Drawable:
         return np.asarray(np.clip(self.embedding @ numbers, 0, most))
 
 
-def drawable_of_result(run: Result) -> Drawable:
-    """Return the bodies of a result. Raises InputError if they cannot be drawn."""
+def drawable_of_result(run: Result, name: str = "") -> Drawable:
+    """Return the bodies of a result. Raises InputError if they cannot be drawn.
+
+    name : name of the file, for messages; the result's own if empty
+    """
+    name = name or str(run.path)
     scene = read_scene(run)
     if "embedding/weights" not in run:
-        raise InputError(
-            f"{run.path} has no surface to draw: its scene says output.surface = false"
-        )
+        raise InputError(f"{name} has no surface to draw: its scene says output.surface = false")
     if not len(run.frames):
         raise InputError(f"{run.path} has no finished frame")
     nodes = run.lattice.nodes[:]
@@ -169,7 +166,7 @@ def drawable_of_result(run: Result) -> Drawable:
         return run.frames.von_mises[index].astype(float)
 
     return Drawable(
-        name=str(run.path),
+        name=name,
         scene=scene,
         rest=BodiesAtRest(nodes, run.indices("lattice/cells"), run.surface.points[:], *bodies),
         pinned=pinned,
@@ -181,38 +178,6 @@ def drawable_of_result(run: Result) -> Drawable:
         solids=solids_of(run),
         von_mises=von_mises if "von_mises" in run.frames else None,
         frequencies=np.ravel(run.attributes.get("frequencies", [])),
-    )
-
-
-def drawable_of_model(path: Path, scene: "Scene", model: "Model") -> Drawable:
-    """Return the bodies of a scene before its first step, from a model on a single process.
-
-    Raises InputError if the model has no surface.
-    """
-    lattice = model.lattice.with_springs()
-    surface = model.surface
-    embedding = model.embedding
-    owned = lattice.owned
-    if surface is None or embedding is None:
-        raise InputError(f"{path} has no surface to draw: it says output.surface = false")
-    start = np.asarray(model.start[0])[:owned]
-    bodies = lattice.body[:owned], model.body_of_point
-    arrays = {
-        "lattice/cell_kind": lattice.cell_kind,
-        "lattice/springs": lattice.global_numbers[lattice.springs],
-        "lattice/rest_length": lattice.rest_length,
-    }
-    return Drawable(
-        name=str(path),
-        scene=scene,
-        rest=BodiesAtRest(lattice.nodes[:owned], lattice.cells, surface.points, *bodies),
-        pinned=lattice.pinned[:owned],
-        triangles=surface.triangles,
-        times=np.zeros(1),
-        nodes=lambda _: start,
-        embedding=embedding,
-        array=arrays.__getitem__,
-        solids=model.solids,
     )
 
 

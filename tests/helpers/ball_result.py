@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from mpi4py import MPI
-from study_stand_in import blank_frame
 
+from msmpetsc.fields import Frame
 from msmpetsc.results.writer import Begin, ResultFile
 
 BARE = """
@@ -60,5 +60,5 @@ def write_ball(path: Path, scene: str = SCENE) -> Path:
             points = ball.vertices * [1, 1, min(1, height / 0.1)] + [0, 0, height]
             energies = dict(kinetic=KINETIC[index], elastic=ELASTIC[index], potential=height)
             place = dict(time=index / 10, position=points, surface=points)
-            file.append(blank_frame(index=index, **place, **energies))
+            file.append(Frame(index=index, **place, **energies))
     return path

@@ -13,7 +13,6 @@ import os
 import subprocess
 import sys
 import tomllib
-from dataclasses import MISSING, fields
 from pathlib import Path
 from time import sleep
 
@@ -78,13 +77,7 @@ def write(comm, out: Path, table: dict, every: int, count: int) -> None:
             x = NODES + (1 + step) * time * np.array([0, 0, 1.0])
             solved = dict(step_error=0.01, iterations=3 * every, ksp_its=30 * every)
             place = dict(index=index, time=time, position=x[own])
-            file.append(blank_frame(wall_time=every * step * count, **place, **solved))
-
-
-def blank_frame(**given) -> Frame:
-    """Return a frame of zeros with the given values."""
-    blank = {field.name: 0.0 for field in fields(Frame) if field.default is MISSING}
-    return Frame(**blank | {"surface": None, "momentum": np.zeros(3)} | given)
+            file.append(Frame(wall_time=every * step * count, **place, **solved))
 
 
 def told(ranks: int, count: int) -> dict:

@@ -7,7 +7,6 @@ from itertools import count
 
 import numpy as np
 import pytest
-from study_stand_in import blank_frame
 
 from msmpetsc.comm import log
 from msmpetsc.fields import Frame
@@ -17,7 +16,7 @@ from msmpetsc.results.progress_bar import Progress
 
 def frame(index: int) -> Frame:
     place = dict(index=index, time=index / 60, position=np.zeros((0, 3)))
-    return blank_frame(step_error=8.1e-4, ksp_its=45, **place)
+    return Frame(step_error=8.1e-4, ksp_its=45, **place)
 
 
 class Terminal(io.StringIO):

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from scipy.spatial.transform import Rotation
-from study_stand_in import blank_frame
 
 from msmpetsc.errors import InputError
+from msmpetsc.fields import Frame
 from msmpetsc.results.writer import ResultFile
 from msmpetsc.study.metrics import (
     distance_of_shapes,
@@ -29,7 +29,7 @@ def result(
         file.start_frames(len(times), len(mass))
         for index, now in enumerate(times):
             values = {name: column[index] for name, column in series.items()}
-            file.append(blank_frame(index=index, time=now, position=positions[index], **values))
+            file.append(Frame(index=index, time=now, position=positions[index], **values))
     return path
 
 

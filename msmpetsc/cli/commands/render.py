@@ -5,6 +5,7 @@ import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
@@ -17,12 +18,13 @@ from msmpetsc.app.checks import (
     refuse_other_format,
 )
 from msmpetsc.errors import InputError
+from msmpetsc.fields import Frame
 from msmpetsc.results.frame_choice import Frames, frames_of
 from msmpetsc.results.reader import Result
 from msmpetsc.results.untrusted_file import plain_damage
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.view.composition import Style, composition_of
-from msmpetsc.view.drawable import Drawable, drawable_of_model, drawable_of_result
+from msmpetsc.view.drawable import Drawable, drawable_of_result
 from msmpetsc.view.film import playback_of, write_film
 from msmpetsc.view.mesh import cut_open, drawn
 from msmpetsc.view.page import write_page
@@ -94,35 +96,50 @@ def _draw_unrun(args: argparse.Namespace, path: Path, style: Style) -> None:
             raise InputError(f"--{option} is for results, and {args.subject} is a scene")
     if path.suffix.lower() in MOVIE_NAMES:
         raise InputError(f"{args.subject} has no motion to film: *.html turns it around")
-    subject, about = drawable_of_scene(args.subject, args.set)
-    if path.suffix.lower() not in PICTURE_NAMES:
-        write_page(subject, path, [0], style)
-        return
+    with TemporaryDirectory(prefix="msmpetsc-render-") as folder:
+        result = Path(folder, "start.h5")
+        cells = _write_start(args.subject, args.set, result)
+        with Result(result) as run:
+            subject = drawable_of_result(run, str(args.subject))
+            if path.suffix.lower() in PICTURE_NAMES:
+                _draw_start(subject, cells, path, style)
+            else:
+                write_page(subject, path, [0], style)
+
+
+def _draw_start(subject: Drawable, cells: str, path: Path, style: Style) -> None:
+    """Draw bodies before their first step as a picture, also cut open, with a line on the cells."""
+    sides = " x ".join(f"{length:.4g}" for length in np.ptp(subject.rest.points, axis=0))
     composition = composition_of(drawn(subject), [0], replace(style, size=style.size or STILL))
     (still,) = composition.stills([0])
-    stills = [replace(still, caption=(subject.title, about[0]))]
+    stills = [replace(still, caption=(subject.title, f"{sides} m"))]
     if not style.cells:
         cut = cut_open(subject, composition.camera)
-        stills.append(replace(still, caption=("cut open", about[1]), cut=cut))
+        stills.append(replace(still, caption=("cut open", cells), cut=cut))
     draw_panels(composition, stills, path)
 
 
-def drawable_of_scene(path: Path, changes: list[str]) -> tuple[Drawable, tuple[str, str]]:
-    """Return the drawable of a scene, with its size and cells as text. Raises InputError."""
+def _write_start(path: Path, changes: list[str], result: Path) -> str:
+    """Write the start of a scene as a result of one frame; return the number of cells as text.
+
+    Raises InputError.
+    """
     # imported here, as drawing a result needs neither MPI nor compiled kernels
     from mpi4py import MPI
 
     from msmpetsc.build import build_model
     from msmpetsc.results.checkpoint_reader import end_of_run
+    from msmpetsc.results.writer import ResultFile, write_model
 
     scene = load_scene(path, changes)
     comm = MPI.COMM_SELF
     model = build_model(comm, scene, None, partial(end_of_run, comm, scene.folder))
-    subject = drawable_of_model(path, scene, model)
     lattice = model.lattice
-    cells = f"{len(lattice.cells)} cells of {lattice.cell_size:.4g} m, {lattice.owned} nodes"
-    sides = " x ".join(f"{length:.4g}" for length in np.ptp(subject.rest.points, axis=0))
-    return subject, (f"{sides} m", cells)
+    with ResultFile(result, comm, {"scene": scene.text}) as file:
+        write_model(comm, file, model)
+        file.start_frames(1, lattice.owned)
+        file.append(Frame(0, 0.0, model.start[0][: lattice.owned]))
+    return f"{len(lattice.cells)} cells of {lattice.cell_size:.4g} m, {lattice.owned} nodes"
 
 
 def _size(text: str | None) -> tuple[int, int] | None:

@@ -8,8 +8,8 @@ from mpi4py import MPI
 from msmpetsc.app.request import RunRequest
 from msmpetsc.app.start import options_given
 from msmpetsc.comm import on_root
-from msmpetsc.errors import InputError
 from msmpetsc.fields import Frame
+from msmpetsc.results.disk import refuse_existing
 
 # for type checkers only: PETSc must get its options before it is imported
 if TYPE_CHECKING:
@@ -30,20 +30,14 @@ def find_modes(comm: MPI.Intracomm, request: RunRequest, count: int) -> "Modes":
         from msmpetsc.app.running import described_model, prepare
         from msmpetsc.solve.natural_modes import modes_of
 
-        if request.output and not request.overwrite:
-            on_root(comm, lambda: refuse_existing(request))
+        if request.output:
+            on_root(comm, lambda: refuse_existing(request.path, request.overwrite))
         plan = prepare(comm, request, None)
         model = described_model(comm, plan)
         modes = modes_of(comm, plan.scene, model, count)
         if request.output:
             _write(comm, plan, model, modes)
     return modes
-
-
-def refuse_existing(request: RunRequest) -> None:
-    """Raise InputError if the output exists, before the modes are searched."""
-    if request.path.exists():
-        raise InputError(f"{request.path} exists: --overwrite replaces it")
 
 
 def _write(comm: MPI.Intracomm, plan: "RunPlan", model: "Model", modes: "Modes") -> None:

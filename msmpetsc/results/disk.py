@@ -53,6 +53,13 @@ def refuse_no_file(path: Path) -> None:
         raise InputError(f"{path} is a pipe or a device, not a file")
 
 
+def refuse_existing(path: Path, overwrite: bool) -> None:
+    """Raise InputError if the path is no file, or a file that may not be replaced."""
+    refuse_no_file(path)
+    if path.exists() and not overwrite:
+        raise InputError(f"{path} exists: --overwrite replaces it")
+
+
 def refuse_read_only(path: Path) -> None:
     """Raise OSError for an existing file that cannot be written."""
     if path.exists():

@@ -30,7 +30,7 @@ from msmpetsc.results.disk import (
     Lock,
     Storage,
     plain_errors,
-    refuse_no_file,
+    refuse_existing,
     refuse_small_disk,
     unlink_inode,
 )
@@ -199,7 +199,7 @@ class ResultFile:
             if self._file is not None:
                 if self._begin is not Begin.IN_PLACE:
                     self._flush(self._file)
-                    self._refuse_to_replace()
+                    refuse_existing(self.path, self._begin is not Begin.NEW)
                     os.replace(self._part, self.path)
                 self._numbers = number_places(self._file["frames"])
         self._descriptor = open_on_all_ranks(self._comm, self.path)
@@ -250,8 +250,7 @@ class ResultFile:
 
     def _open(self, attributes: dict[str, Any]) -> None:
         """Take the lock and open the file: the existing file in place, or a new temporary file."""
-        if self._begin is not Begin.IN_PLACE:
-            self._refuse_to_replace()
+        refuse_existing(self.path, self._begin is not Begin.NEW)
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with ExitStack() as opened:
             lock = Lock(self.path)
@@ -276,12 +275,6 @@ class ResultFile:
         file.flush()
         if self._storage is not None and self._storage.failure is not None:
             raise self._storage.failure
-
-    def _refuse_to_replace(self) -> None:
-        """Raise InputError if the path is no file, or a file that may not be replaced."""
-        refuse_no_file(self.path)
-        if self.path.exists() and self._begin is Begin.NEW:
-            raise InputError(f"{self.path} exists: --overwrite replaces it")
 
     def _lay_out(self, file: h5py.File, layout: Layout) -> None:
         """Create the datasets, or check the existing datasets of a file written in place.

@@ -129,7 +129,7 @@ def test_series_prints_what_the_file_has_and_replaces_nothing_unasked(tmp_path, 
     assert column["probe top, middle z [m]"][2] == pytest.approx(frames[2].probe[0, 2], rel=1e-12)
     capsys.readouterr()
     assert status_of("series", tmp_path / "1.h5", "-o", tmp_path / "1.csv") == 2
-    assert "exists already: --overwrite replaces it" in capsys.readouterr().err
+    assert "exists: --overwrite replaces it" in capsys.readouterr().err
 
 
 def test_a_probe_goes_with_its_cell(tmp_path):

@@ -19,7 +19,7 @@ from msmpetsc.comm import log
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.geometry.registry import MODELS, load, locate
 from msmpetsc.geometry.surface import check_encloses, examine
-from msmpetsc.results.disk import write_whole
+from msmpetsc.results.disk import refuse_existing, write_whole
 from msmpetsc.scene.key_table import SCHEMA_FILE, json_schema
 from msmpetsc.scene.reading import lies_below, scene_of
 
@@ -77,8 +77,7 @@ def run(args: argparse.Namespace) -> int:
             "msmpetsc new my.toml --mesh my.ply"
         )
     refuse_other_format("new", args.scene, SCENE_NAMES)
-    if args.scene.exists() and not args.overwrite:
-        raise InputError(f"{args.scene} exists already: --overwrite replaces it")
+    refuse_existing(args.scene, args.overwrite)
     if args.from_scene is not None:
         text = f"#:schema {SCHEMA_FILE}\n{shipped_text(args.from_scene)}"
     else:

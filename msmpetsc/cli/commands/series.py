@@ -7,8 +7,7 @@ import sys
 from collections.abc import Iterator
 
 from msmpetsc.backend.arrays import Floats
-from msmpetsc.errors import InputError
-from msmpetsc.results.disk import write_whole
+from msmpetsc.results.disk import refuse_existing, write_whole
 from msmpetsc.results.reader import Result
 from msmpetsc.results.untrusted_file import plain_damage
 from msmpetsc.scene.schema import HOLDERS, SURFACE_LOADS, SceneFile
@@ -22,8 +21,8 @@ SERIES = (
 
 def run(args: argparse.Namespace) -> int:
     """Write the series of a result; return the exit status."""
-    if args.output and args.output.exists() and not args.overwrite:
-        raise InputError(f"{args.output} exists already: --overwrite replaces it")
+    if args.output:
+        refuse_existing(args.output, args.overwrite)
     with plain_damage(args.result), Result(args.result) as result:
         text = series_text(result, read_scene(result))
     if args.output is None:

@@ -104,18 +104,15 @@ def stored_scene(earlier: Earlier, changes: list[str]) -> Scene:
     # The result and the scene folder that it names may be untrusted. So each file of
     # the stored scene must be in the result's folder, or be named by the scene file
     # or by the user.
-    given = [tuple(change.partition("=")[0].strip().split(".")) for change in changes]
     known = set(MODELS)
     with suppress(InputError):
         known |= {name for _, name in load_scene(file).named_files()}
-    for path, name in scene.named_files():
-        keys = tuple(map(str, path))
+    for key, name in scene.named_files(changes):
         is_in_folder = (Path(file).parent / name).resolve().parent == earlier.path.resolve().parent
-        by_user = any(keys[: len(user_keys)] == user_keys for user_keys in given)
-        if not (name in known or is_in_folder or by_user):
+        if not (name in known or is_in_folder):
             raise InputError(
                 f"{earlier.path} names {as_given(name)}, and {as_given(file)} does not: "
-                f"name the SCENE too, or --set {'.'.join(keys)}=PATH"
+                f"name the SCENE too, or --set {key}=PATH"
             )
     return scene
 

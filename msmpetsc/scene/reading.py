@@ -2,7 +2,7 @@
 
 import shlex
 import tomllib
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from itertools import pairwise
 from os import PathLike
 from pathlib import Path
@@ -12,7 +12,7 @@ import tomli_w
 from pydantic import Field, ValidationError
 
 from msmpetsc.errors import InputError
-from msmpetsc.scene.problems import KeyPath, as_given, problem_lines
+from msmpetsc.scene.problems import as_given, problem_lines
 from msmpetsc.scene.schema import SceneFile
 from msmpetsc.scene.toml import overrides_of, plain
 
@@ -79,7 +79,7 @@ class Scene(SceneFile):
         InputError
             Has a line for each problem of the scene.
         """
-        return _checked(Path(folder) / "scene", plain(tables), "", changes)[0]
+        return _checked(Path(folder) / "scene", plain(tables), "", overrides_of(changes))
 
     def changed(self, changes: Changes) -> "Scene":
         """Return a checked copy of the scene with changes.
@@ -134,23 +134,23 @@ def scene_of(
     data = _parse(path, text)
     if "mesh" not in data and not OF_STUDIES.isdisjoint(data):
         raise InputError(f"{path}: is a study, no scene: msmpetsc study {shlex.quote(str(path))}")
-    scene, keys = _checked(path, data, text, changes)
+    overrides = overrides_of(changes)
+    scene = _checked(path, data, text, overrides)
     if to_read:
-        _refuse_outside(path, scene, keys if by_user else None)
+        _refuse_outside(path, scene, overrides if by_user else None)
     return scene
 
 
-def _checked(
-    path: Path, data: dict[str, Any], text: str, changes: Changes
-) -> tuple[Scene, Collection[KeyPath]]:
-    """Return the checked scene, and the key paths that the changes set. Raises InputError."""
-    keys = {_override(data, override): override for override in overrides_of(changes)}
+def _checked(path: Path, data: dict[str, Any], text: str, overrides: list[str]) -> Scene:
+    """Return the checked scene of data with overrides. Raises InputError."""
+    for override in overrides:
+        _override(data, override)
     try:
         checked = SceneFile.model_validate(data)
         # only given fields, so that an absent ``mesh`` or ``body`` stays absent
         given = {name: getattr(checked, name) for name in checked.model_fields_set}
-        text = tomli_w.dumps(data) if keys or not text else text
-        return Scene(**given, text=text, folder=path.parent), keys
+        text = tomli_w.dumps(data) if overrides or not text else text
+        return Scene(**given, text=text, folder=path.parent)
     except ValidationError as error:
         raise InputError("\n".join(problem_lines(path, error))) from None
     except RecursionError:
@@ -164,20 +164,18 @@ def read_toml(path: Path, kind: str = "scene") -> dict[str, Any]:
     return _parse(path, _read(path, kind))
 
 
-def _refuse_outside(path: Path, scene: SceneFile, given: Collection[KeyPath] | None) -> None:
+def _refuse_outside(path: Path, scene: SceneFile, overrides: list[str] | None) -> None:
     """Raise InputError if a file that the user did not name is outside the scene's folder.
 
-    given : key paths that the user set; None if the changes are not the user's
+    overrides : changes by the user; None if the changes are not the user's
     """
-    for keys, name in scene.named_files():
-        by_user = any(keys[: len(user_keys)] == user_keys for user_keys in given or ())
-        if by_user or lies_below(path.parent, name):
-            continue
-        key = ".".join(map(str, keys))
-        allows = "" if given is None else f"; --set {key}=PATH allows it"
-        raise InputError(
-            f"{path}: {key}: {as_given(name)} is not in the scene's folder, nor below it{allows}"
-        )
+    for key, name in scene.named_files(overrides or ()):
+        if not lies_below(path.parent, name):
+            allows = "" if overrides is None else f"; --set {key}=PATH allows it"
+            raise InputError(
+                f"{path}: {key}: {as_given(name)} is not in the scene's folder, nor below it"
+                f"{allows}"
+            )
 
 
 def lies_below(folder: Path, name: str) -> bool:
@@ -210,8 +208,8 @@ def _parse(path: Path, text: str) -> dict[str, Any]:
         raise InputError(f"{path}: is not TOML: {error}") from None
 
 
-def _override(data: dict[str, Any], override: str) -> KeyPath:
-    """Apply an override "key.path=value" to ``data`` and return its key path."""
+def _override(data: dict[str, Any], override: str) -> None:
+    """Apply an override "key.path=value" to ``data``. Raises InputError."""
     try:
         name, equals, raw = override.partition("=")
         path = tuple(int(key) if key.isdecimal() else key for key in name.strip().split("."))
@@ -225,7 +223,6 @@ def _override(data: dict[str, Any], override: str) -> KeyPath:
         _put(container, path[-1], value, replace=True)
     except InputError as error:
         raise InputError(f"--set {as_given(override)}: {error}") from None
-    return path
 
 
 def _override_value(raw: str) -> Any:

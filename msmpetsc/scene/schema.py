@@ -1,6 +1,6 @@
 """The schema of a scene file: frozen, validated tables with meaning and unit of each key."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import chain
 from typing import Any, Literal, NamedTuple
 
@@ -290,11 +290,14 @@ class SceneFile(Table):
         """Yield key path and value of each key whose value is no table."""
         yield from _leaves((), self.model_dump(exclude_none=True, by_alias=True))
 
-    def named_files(self) -> Iterator[tuple[KeyPath, str]]:
-        """Yield key path and name of each file; the name of a mesh may be a registry name."""
+    def named_files(self, changes: Iterable[str] = ()) -> Iterator[tuple[str, str]]:
+        """Yield key and name of each file that no ``--set`` of ``changes`` gives."""
+        changed = tuple(f"{change.partition('=')[0].strip()}." for change in changes)
         for path, value in self.leaves():
-            if path[-1] in ("source", "from", "painted") and isinstance(value, str):
-                yield path, value
+            key = ".".join(map(str, path))
+            is_file = path[-1] in ("source", "from", "painted") and isinstance(value, str)
+            if is_file and not f"{key}.".startswith(changed):
+                yield key, value
 
 
 def _leaves(path: KeyPath, value: Any) -> Iterator[tuple[KeyPath, Any]]:

@@ -19,11 +19,6 @@ from msmpetsc.export.usd import frames_a_second, up_axis
 TRIANGLES = np.array([[0, 1, 2], [1, 2, 3]])
 
 
-@pytest.fixture
-def result(tmp_path: Path) -> Path:
-    return small_result.write(tmp_path / "x.h5")
-
-
 def opened(path: Path) -> tuple[Usd.Stage, list[UsdGeom.Mesh]]:
     """Return the stage and its meshes, which live as long as the stage."""
     stage = Usd.Stage.Open(str(path))
@@ -37,8 +32,10 @@ def points_of(mesh: UsdGeom.Mesh, code: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("ending", [".usd", ".usda", ".usdc"])
-def test_points_are_those_of_the_result_at_every_time(result: Path, tmp_path: Path, ending: str):
-    path = export(result, tmp_path / f"y{ending}")
+def test_points_are_those_of_the_result_at_every_time(
+    bar_result: Path, tmp_path: Path, ending: str
+):
+    path = export(bar_result, tmp_path / f"y{ending}")
     assert path.read_bytes().startswith(b"#usda" if ending == ".usda" else b"PXR-USDC")
     stage, (mesh,) = opened(path)
     rate = stage.GetTimeCodesPerSecond()
@@ -65,8 +62,8 @@ def test_points_far_from_the_origin_are_exact(tmp_path: Path):
         assert points_of(mesh, index) == pytest.approx(surface(index) + FAR, rel=0, abs=1e-7)
 
 
-def test_the_mesh_is_what_usd_asks_for(result: Path, tmp_path: Path):
-    _stage, (mesh,) = opened(export(result, tmp_path / "y.usdc"))
+def test_the_mesh_is_what_usd_asks_for(bar_result: Path, tmp_path: Path):
+    _stage, (mesh,) = opened(export(bar_result, tmp_path / "y.usdc"))
     counts, corners = mesh.GetFaceVertexCountsAttr().Get(), mesh.GetFaceVertexIndicesAttr().Get()
     assert list(counts) == [3, 3] and list(corners) == TRIANGLES.ravel().tolist()
     assert UsdGeom.Mesh.ValidateTopology(corners, counts, len(POINTS)) == (True, "")
@@ -75,8 +72,9 @@ def test_the_mesh_is_what_usd_asks_for(result: Path, tmp_path: Path):
     assert mesh.GetNormalsInterpolation() == "vertex"
 
 
-def test_several_bodies_are_a_mesh_each(result: Path, tmp_path: Path):
+def test_several_bodies_are_a_mesh_each(tmp_path: Path):
     """Two bodies, the small result twice, are a mesh each; the second moves the other way."""
+    result = small_result.write(tmp_path / "x.h5")
     with h5py.File(result, "r+") as file:
         moved = file["frames/surface"][:]
         for name in ("surface/points", "surface/triangles", "frames/surface"):
@@ -93,8 +91,8 @@ def test_several_bodies_are_a_mesh_each(result: Path, tmp_path: Path):
     assert list(second.GetFaceVertexIndicesAttr().Get()) == [0, 1, 2]
 
 
-def test_chosen_frames_keep_their_times(result: Path, tmp_path: Path):
-    stage, (mesh,) = opened(export(result, tmp_path / "y.usda", frames=[1, 3, 4]))
+def test_chosen_frames_keep_their_times(bar_result: Path, tmp_path: Path):
+    stage, (mesh,) = opened(export(bar_result, tmp_path / "y.usda", frames=[1, 3, 4]))
     rate = stage.GetTimeCodesPerSecond()
     times = np.array(mesh.GetPointsAttr().GetTimeSamples()) / rate
     assert times == pytest.approx([0.01, 0.03, 0.04])
@@ -112,7 +110,7 @@ def test_upward_is_against_gravity(gravity: tuple[float, ...], axis: str):
     assert up_axis({}) == "Z"
 
 
-def test_a_name_that_usd_would_not_take(result: Path, tmp_path: Path):
-    result = result.rename(tmp_path / "2 bars-é.h5")
+def test_a_name_that_usd_would_not_take(tmp_path: Path):
+    result = small_result.write(tmp_path / "2 bars-é.h5")
     stage, found = opened(export(result, tmp_path / "2 bars-é.usda"))
     assert stage.GetDefaultPrim().IsValid() and len(found) == 1

@@ -29,10 +29,6 @@ SURFACE_FIELDS = ("frames/surface", "surface/points", "surface/triangles")
 MEAN = "surface, rms"
 
 
-class DifferentLattices(InputError):
-    """Two results are not on the same lattice."""
-
-
 @dataclass
 class FieldError:
     """The difference between two results in a field.
@@ -72,11 +68,10 @@ class Comparison:
 # values that overflow are reported as different
 @np.errstate(all="ignore")
 def compare(a: Result, b: Result) -> Comparison:
-    """Compare the fields COMPARED of two results at their common times.
+    """Compare the fields COMPARED of two results on a lattice at their common times.
 
-    Raises DifferentLattices if the lattices differ, InputError if the results share no time.
+    Raises InputError if the results share no time.
     """
-    refuse_different_lattices(a, b)
     either = [name for name in COMPARED if name in a.frames or name in b.frames]
     chosen = [name for name in either if name in a.frames and name in b.frames]
     pairs = shared_frames(a, b)
@@ -180,10 +175,10 @@ def rows_agree(a: Array, b: Array, tolerance: float) -> Mask:
     return agree
 
 
-def refuse_different_lattices(a: Result, b: Result) -> None:
-    """Raise DifferentLattices, with a reason, if two results are not on the same lattice."""
-    if reason := first_mismatch(a.lattice.nodes[:], b.lattice.nodes[:], "node"):
-        raise DifferentLattices(f"{a.path} and {b.path} are runs of different lattices: {reason}")
+def different_lattices(a: Result, b: Result) -> str:
+    """Return in words how the lattices of two results differ; "" if they are the same."""
+    reason = first_mismatch(a.lattice.nodes[:], b.lattice.nodes[:], "node")
+    return reason and f"{a.path} and {b.path} are runs of different lattices: {reason}"
 
 
 def first_mismatch(a: Positions, b: Positions, kind: str) -> str:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from msmpetsc.backend.arrays import Floats
 from msmpetsc.errors import InputError
-from msmpetsc.results.comparison import compare_surfaces, refuse_different_lattices, shared_frames
+from msmpetsc.results.comparison import compare_surfaces, different_lattices, shared_frames
 from msmpetsc.results.reader import Result
 from msmpetsc.study.table import Row
 
@@ -171,7 +171,8 @@ def trajectory_error(result: Path, reference: Path) -> float:
     lattices or no common time, or if nothing moves.
     """
     with Result(result) as run, Result(reference) as true:
-        refuse_different_lattices(run, true)
+        if differ := different_lattices(run, true):
+            raise InputError(differ)
         rest, mass = true["lattice/nodes"][:], true["lattice/mass"][:]
         off = moved = 0.0
         for of_run, of_reference in shared_frames(run, true):

@@ -10,10 +10,10 @@ import numpy as np
 from msmpetsc.errors import InputError
 from msmpetsc.results.comparison import (
     Comparison,
-    DifferentLattices,
     FieldError,
     compare,
     compare_surfaces,
+    different_lattices,
     point_text,
     rest_of,
 )
@@ -55,10 +55,9 @@ def run(args: argparse.Namespace) -> int:
 
 def compared(first: Result, second: Result) -> tuple[Comparison, list[str]]:
     """Return the comparison of two results, and notes; surfaces only if the lattices differ."""
-    try:
+    differ = different_lattices(first, second)
+    if not differ:
         return compare(first, second), []
-    except DifferentLattices as error:
-        differ = str(error)
     try:
         comparison = compare_surfaces(first, second)
     except InputError as error:

@@ -187,13 +187,12 @@ def study_cases(study: Study, folder: Path, full: bool) -> list[Case]:
 
 
 def with_laws(scene: StudyScene, sweep: Sweep) -> Iterator[tuple[StudyScene, Sweep]]:
-    """Yield scene and sweep for each material law of the sweep; the label names the law."""
+    """Yield the scene and a sweep of a single law for each material law of the sweep."""
     if not sweep.laws:
         yield scene, sweep
     for law in sweep.laws:
-        label = ", ".join(filter(None, (sweep.label, law)))
         changed = scene.model_copy(update={"set": (*scene.set, f"material.law={law}")})
-        yield changed, sweep.model_copy(update={"label": label})
+        yield changed, sweep.model_copy(update={"laws": (law,)})
 
 
 def sweep_cases(study: Study, scene: StudyScene, sweep: Sweep, folder: Path) -> Iterator[Case]:
@@ -238,6 +237,10 @@ def _methods(base: Case, scene: StudyScene, sweep: Sweep, as_given: Scene) -> It
 def _label(sweep: Sweep, case: Case) -> str:
     integrator = case.integrator.removeprefix("implicit-euler")
     name = sweep.label or " ".join(filter(None, (integrator, case.preset, case.options)))
+    if sweep.laws:
+        has_methods = max(map(len, (sweep.integrators, sweep.presets, sweep.options))) > 1
+        # the law alone names the curve if all cases have the same method
+        name = ", ".join([*([name] if sweep.label or has_methods else []), *sweep.laws])
     if case.ranks == 1 or len(sweep.ranks) == 1:
         return name
     return f"{name}, {case.ranks} ranks"

@@ -137,6 +137,8 @@ def test_a_law_is_that_of_the_reference_too(tmp_path: Path):
     assert [case.label for case in found] == ["linear", "neo-hookean"]
     for case in found:
         assert all(f"material.law={case.label}" in each.set for each in (case, case.reference))
+    methods = '\npresets = ["newton", "anderson"]\noptions = ["", "-pc_type icc"]'
+    assert len({case.label for case in all_cases(tmp_path, ONE_SCENE + sweep + methods)}) == 2 * 4
     common = reference.replace("cells", 'law = "linear", cells')
     for case in all_cases(tmp_path, ONE_SCENE + common + sweep):
         laws = [word for word in case.reference.set if word.startswith("material.law")]

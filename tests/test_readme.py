@@ -34,6 +34,7 @@ from msmpetsc.geometry.registry import locate
 from msmpetsc.scene.reading import load_scene
 from msmpetsc.scene.schema import BodyTable, SceneFile
 from msmpetsc.solve.presets import PRESETS
+from msmpetsc.study.cases import study_cases
 from msmpetsc.study.study_file import load_study
 from msmpetsc.study.table import COLUMNS
 
@@ -282,8 +283,7 @@ def test_the_study_files_are_some(tmp_path: Path):
     path = tmp_path / "study.toml"
     for text in blocks(STUDIES, "toml"):
         path.write_text(text)
-        study = load_study(path)
-        assert study.sweep or study.map
+        assert study_cases(load_study(path), ROOT / "scenes" / "studies", full=True)
 
 
 def test_the_page_of_the_study_table_has_each_column():

@@ -89,6 +89,9 @@ def _kind(path: Path) -> str:
 
 def _content(path: Path) -> bytes:
     """Return the bytes of a file. Raises InputError if it cannot be read or is empty."""
+    # a pipe or a device may have no end
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise InputError(f"{path}: is a pipe or a device, not a file")
     try:
         data = path.read_bytes()
     except (OSError, MemoryError) as error:

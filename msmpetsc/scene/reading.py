@@ -189,6 +189,9 @@ def lies_below(folder: Path, name: str) -> bool:
 
 def _read(path: Path, kind: str) -> str:
     """Return the text of a file. Raises InputError that calls it a ``kind`` file."""
+    # a pipe or a device may have no end
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise InputError(f"{path}: is a pipe or a device, not a {kind} file")
     try:
         # -sig drops a byte order mark, which some editors write
         return path.read_text("utf-8-sig")

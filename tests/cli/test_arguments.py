@@ -89,6 +89,16 @@ def test_a_path_that_cannot_be_used_is_refused_in_one_line(folder, monkeypatch, 
     } == before
 
 
+@pytest.mark.parametrize("suffix", ["obj", "vtu"])
+def test_a_pipe_that_a_scene_or_a_study_names_is_refused(folder, capsys, suffix):
+    os.mkfifo(pipe := folder / f"pipe.{suffix}")
+    scene, study = folder / "scene.toml", folder / "of_pipe.toml"
+    study.write_text(f'[[scene]]\nname = "a"\nfile = "{pipe.name}"\n[[sweep]]\n')
+    for command in (["run", scene, "--set", f"mesh.source={pipe}"], ["study", study, "--list"]):
+        assert main([*map(str, command)]) == 2
+        assert "is a pipe or a device" in capsys.readouterr().err
+
+
 TOO_MUCH = {
     "ranks": (
         ["inspect", "scene.toml", "--ranks", "9999999999"],

@@ -49,58 +49,33 @@ EVENTS = {
 FAR = 0.3
 
 
-class TrueErrors:
-    """Measure true errors of steps against steps solved to rounding. Their time is not counted.
+def true_errors(stepper: Stepper, problem: StepProblem, position: Positions) -> Floats:
+    """Return the errors (2,) of a step's solution ``position`` (l, 3) [m] (collective).
 
-    stepper   : solver of the run that the reference solver was made for
-    reference : solver of the reference steps
+    A reference solver solves the step to rounding; its time is not counted. The relative position
+    error is |x - x*|_M / |y - x*|_M, the relative energy error (g(x) - g*) / (g(y) - g*). Both are
+    NaN if the reference solve fails.
     """
-
-    def __init__(self) -> None:
-        self.stepper: Stepper | None = None
-        self.reference: Stepper | None = None
-
-    def errors(self, stepper: Stepper, problem: StepProblem, position: Positions) -> Floats:
-        """Return the errors (2,) of a step's solution ``position`` (l, 3) [m] (collective).
-
-        The relative position error is |x - x*|_M / |y - x*|_M, the relative energy error
-        (g(x) - g*) / (g(y) - g*). Both are NaN if the reference solve fails.
-        """
+    with begun(REFERENCE):
+        reference = replace(
+            stepper,
+            preset=find_preset(REFERENCE_PRESET),
+            error=REFERENCE_ERROR,
+            max_iterations=None,
+            prefix=REFERENCE_PREFIX,
+        )
         try:
-            with begun(REFERENCE):
-                reference = self._reference(stepper)
-                # An error must not depend on earlier measurements.
-                reference.forget()
-                exact = reference.step(problem, position).position
+            reference.set_up()
+            exact = reference.step(problem, position).position
+            start, distance = (_distances(reference, x, exact) for x in (problem.y, position))
+            errors: Floats = np.divide(distance, start, out=np.zeros(2), where=start > 0)
+            errors[0] = reference.control.rounding.step_error(errors[0], start[0])
+            return errors
         except StepFailed as failure:
             log.warning("the true error of a step is not known: its reference %s", failure)
             return np.full(2, np.nan)
-        start, distance = (_distances(reference, x, exact) for x in (problem.y, position))
-        errors: Floats = np.divide(distance, start, out=np.zeros(2), where=start > 0)
-        errors[0] = reference.control.rounding.step_error(errors[0], start[0])
-        return errors
-
-    def _reference(self, stepper: Stepper) -> Stepper:
-        """Return the reference solver for ``stepper`` (collective)."""
-        # The run makes a new solver when an anchor ends.
-        if self.reference is None or self.stepper is not stepper:
-            self.destroy()
-            self.stepper = stepper
-            preset = find_preset(REFERENCE_PRESET)
-            self.reference = replace(
-                stepper,
-                preset=preset,
-                error=REFERENCE_ERROR,
-                max_iterations=None,
-                prefix=REFERENCE_PREFIX,
-            )
-            self.reference.set_up()
-        return self.reference
-
-    def destroy(self) -> None:
-        """Destroy all PETSc objects (collective)."""
-        if self.reference:
-            self.reference.destroy()
+        finally:
+            reference.destroy()
 
 
 def _distances(reference: Stepper, x: Positions, exact: Positions) -> Floats:

@@ -26,7 +26,7 @@ from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.schema import HOLDERS, Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
-from msmpetsc.solve.instrumentation import REFERENCE_PREFIX, REFERENCE_PRESET, Monitors, TrueErrors
+from msmpetsc.solve.instrumentation import REFERENCE_PREFIX, REFERENCE_PRESET, Monitors, true_errors
 from msmpetsc.solve.integrators.adaptive import Adaptive
 from msmpetsc.solve.integrators.implicit import Bdf2, ImplicitEuler
 from msmpetsc.solve.integrators.integrator import Integrator, State
@@ -146,7 +146,7 @@ class TimeLoop:
         self.recovery = Recovery(
             scene.time, scene.solver, scene.safety.on_failure, self._make, self.balance, take
         )
-        self.monitors, self.true_errors = Monitors(self.environment, self.time_step), TrueErrors()
+        self.monitors = Monitors(self.environment, self.time_step)
         w = model.embedding
         self.surface = None if w is None else EmbeddedPoints(comm, model.lattice, w)
         self.forces = Forces(model, self.environment, self.elasticity)
@@ -210,9 +210,7 @@ class TimeLoop:
         is_recovered = result.cost.substeps + result.cost.fallbacks > 0
         if self.true_error and index % self.true_error == 0 and result.problem and not is_recovered:
             assert isinstance(self.integrator, ImplicitEuler)
-            true, energy = self.true_errors.errors(
-                self.integrator.stepper, result.problem, result.position
-            )
+            true, energy = true_errors(self.integrator.stepper, result.problem, result.position)
             self.monitors.work += Work(true_error=true, energy_error=energy)
         self.monitors.gain(index, time, self.state.budget, self.balance.remedy(result.explicit))
         self.step = index
@@ -341,7 +339,6 @@ class TimeLoop:
 
     def destroy(self) -> None:
         """Destroy all PETSc objects (collective)."""
-        self.true_errors.destroy()
         self.recovery.destroy()
         self.integrator.destroy()
 

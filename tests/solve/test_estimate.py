@@ -13,7 +13,7 @@ from one_process import assert_one_line
 from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Rows
-from msmpetsc.solve.instrumentation import TrueErrors
+from msmpetsc.solve.instrumentation import true_errors
 from msmpetsc.solve.nonlinear import error_control
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
@@ -115,15 +115,13 @@ def test_true_errors_are_those_of_a_dense_solve_of_one_spring():
     m, k, r = 0.3, 40.0, 1.0
     lattice = one_spring(m, k, r)
     stepper = Stepper(COMM, lattice, T, find_preset("newton"))
-    true_errors = TrueErrors()
     q, before = np.array([[0.0, 0, 0], [0, 0, 1.3]]), np.array([[0.0, 0, 0], [0, 0, 1.25]])
     y = 2 * 1.3 - 1.25
     exact = (m * y + T**2 * k * r) / (m + T**2 * k)
     found = [np.array([[0.0, 0, 0], [0, 0, exact + e * (y - exact)]]) for e in (1.0, 0.5, -0.01)]
     problem = StepProblem(q, 2 * q - before, np.zeros((2, 3)))
-    errors = [true_errors.errors(stepper, problem, x) for x in found]
-    for owned in (true_errors, stepper):
-        owned.destroy()
+    errors = [true_errors(stepper, problem, x) for x in found]
+    stepper.destroy()
     np.testing.assert_allclose(errors, [[1, 1], [0.5, 0.25], [0.01, 1e-4]], rtol=1e-6)
 
 

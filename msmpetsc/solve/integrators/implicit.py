@@ -4,10 +4,18 @@ Both integrators solve  M (x - y) + tau^2 (grad E(x) - f_ext) = 0  for x. They d
 positions without forces, and in tau, which is a fixed part of the time step t. In f_ext, loads are
 means over steps, so that their impulse on a free body is their integral over time.
 
-The velocity at the end is v = (x - c) / tau, and y = c + tau w. Mass-proportional damping changes y
-and tau (solve.integrators.mass_damping). For a viscous solid, E contains the dissipation over the
-step (elasticity.viscosity), with x^ = c. The cells' rotation in the viscosity is predicted for the
-middle of the step by implicit Euler, and for its end by BDF2.
+The velocity at the end is v = (x - c) / tau, and y = c + tau w. With mass-proportional damping,
+forces -alpha M v, the step solves
+
+    M (x - c - tau w) + tau alpha M (x - c) + tau^2 (grad E(x) - f_ext) = 0.
+
+Division by 1 + alpha tau gives an undamped problem, so damping costs nothing:
+
+    y = c + tau w / (1 + alpha tau)    and    tau^2 / (1 + alpha tau) for tau^2.
+
+For a viscous solid, E contains the dissipation over the step (elasticity.viscosity), with x^ = c.
+The cells' rotation in the viscosity is predicted for the middle of the step by implicit Euler, and
+for its end by BDF2.
 """
 
 from collections.abc import Callable
@@ -27,7 +35,6 @@ from msmpetsc.errors import StepFailed
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.integrators.integrator import Integrator, State
-from msmpetsc.solve.integrators.mass_damping import carried_time, equivalent_tau
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 from msmpetsc.solve.petsc.events import CONTACT
@@ -178,13 +185,17 @@ class ImplicitEuler(Integrator):
         self.stepper = self._new_stepper(self.time_step)
 
     def _first_tau(self) -> float:
-        """Return tau [s] of the undamped problem."""
+        """Return tau [s] without damping."""
         return self.TAU_PER_STEP * self.time_step
 
     @property
     def damped_tau(self) -> float:
-        """Return tau [s] of the damped problem."""
-        return equivalent_tau(self.tau, self.damping)
+        """Return tau [s] of the undamped problem equal to the damped problem."""
+        return self.tau / float(np.sqrt(1 + self.damping * self.tau))
+
+    def _carried_time(self, duration: float) -> float:
+        """Return d / (1 + alpha d) [s], the time in which a velocity acts over a duration d [s]."""
+        return duration / (1 + self.damping * duration)
 
     def _rates(
         self, q: Positions, y: Positions, q_before: Positions | None
@@ -209,7 +220,7 @@ class ImplicitEuler(Integrator):
         self.environment.forces.begin_step(q, state.velocity(time_step), time - time_step)
         y = 2 * q - state.q_previous
         if self.damping:
-            carried = carried_time(time_step, self.damping)
+            carried = self._carried_time(time_step)
             y = q + carried / time_step * (q - state.q_previous)
         load = self.environment.forces.mean(time - time_step, time)
         result, sides = self._solve(state, y, load, time, time_step)
@@ -349,7 +360,7 @@ class Bdf2(ImplicitEuler):
         before_last = begin - (state.span or self.time_step)
         load = forces.ahead(before_last, begin, time) if state.history else forces.mean(begin, time)
         q_0, v_0 = history
-        carried = carried_time(self.tau, self.damping)
+        carried = self._carried_time(self.tau)
         y = (4 * q - q_0 + carried * (4 * v - v_0)) / 3
         result, sides = self._solve(state, y, load, time, self.time_step, q_0)
         v_1 = (3 * result.position - 4 * q + q_0) / (2 * self.time_step)
@@ -385,7 +396,7 @@ class Bdf2(ImplicitEuler):
         nearly tau^2 |a|_M (1 - |a|_M^2 / a_n^T M a).
         """
         t, tau, q, v = self.time_step, self.tau, state.q, state.velocity(self.time_step)
-        y = q + carried_time(tau, self.damping) * v
+        y = q + self._carried_time(tau) * v
         result, _ = self._solve(state, y, load, time - t + tau, tau)
         v_end = (result.position - q) / tau
         v = np.where(self.stepper.lattice.fixed, v_end, v)

@@ -35,7 +35,6 @@ from msmpetsc.errors import StepFailed
 from msmpetsc.scene.schema import Solver
 from msmpetsc.scene.time import Time
 from msmpetsc.solve.integrators.integrator import Integrator, State
-from msmpetsc.solve.integrators.mass_damping import decay
 from msmpetsc.solve.linear.ghosts import Ghosted
 from msmpetsc.solve.linear.largest_eigenvalue import HighestMode
 from msmpetsc.solve.nonlinear.step import StepResult
@@ -228,7 +227,7 @@ class Verlet(Integrator):
     def _damp(self, duration: float) -> None:
         """Damp the velocities of the free nodes over a duration [s] by exp(-alpha dt)."""
         if self.damping:
-            self.v[self.free] *= decay(duration, self.damping)
+            self.v[self.free] *= np.exp(-self.damping * duration)
 
     def _drift(self, begin: float, end: float) -> None:
         """Move q to the end of a substep: move anchored nodes on their paths, reflect impacts."""

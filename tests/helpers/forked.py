@@ -47,7 +47,7 @@ def started(target: Callable, *given) -> multiprocessing.Process:
 def run_forked(
     arguments: Sequence[str], environment: Mapping[str, str], timeout: float
 ) -> subprocess.CompletedProcess:
-    """Run ``msmpetsc`` with these arguments and return its result as subprocess.run does.
+    """Run ``msmpetsc`` with these arguments and return what subprocess.run returns.
 
     Raises subprocess.TimeoutExpired.
     """
@@ -67,7 +67,7 @@ def run_forked(
 def run_ranks(
     ranks: int, arguments: Sequence[str], environment: Mapping[str, str], timeout: float
 ) -> subprocess.CompletedProcess:
-    """Run Python with these arguments on so many ranks and return the finished process.
+    """Run Python with these arguments on so many ranks and return what subprocess.run returns.
 
     Raises subprocess.TimeoutExpired.
     """

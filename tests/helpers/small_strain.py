@@ -75,15 +75,15 @@ def box(cells: Iterable[int], cell_size: float, poisson: float | None = SPRINGS)
     return lattice_of(mesh, cell_size, poisson=poisson)
 
 
-def hessian(lattice: Lattice) -> csc_array:
-    """Return the Hessian of E (3n, 3n) [N/m] at rest, from 81 products.
+def hessian(lattice: Lattice, q: np.ndarray | None = None) -> csc_array:
+    """Return the Hessian of E (3n, 3n) [N/m] at positions q (n, 3), or at rest, from 81 products.
 
     Nodes three cells apart share no cell, so one product serves all nodes of a colour.
     """
     n = len(lattice.nodes)
     ijk = np.rint((lattice.nodes - lattice.nodes.min(axis=0)) / lattice.cell_size).astype(int)
     colour = ijk % 3 @ [9, 3, 1]
-    product = Elasticity(lattice).hessian_at(lattice.nodes)
+    product = Elasticity(lattice).hessian_at(lattice.nodes if q is None else q)
     triplets = []
     neighbours = csc_array(
         (

@@ -124,6 +124,33 @@ def test_a_paddle_that_goes_by_half_a_ball_a_step_hits_it(tmp_path: Path):
     assert sum(frame.products for frame in frames) < 30_000
 
 
+def ball_beside_a_body(folder: Path) -> Path:
+    """Return a scene in which a ball pushes a free body over a floor, 5 distances a step."""
+    ball = {"shape": "sphere", "center": [-0.1, -0.625, 0], "radius": 0.24, "response": "barrier"}
+    ball["path"] = [{"time": 0.08, "by": [0, 0.08, 0]}]
+    scene = block_scene(
+        folder,
+        material={"young_modulus": 5e4, "density": DENSITY},
+        solver={"preset": "newton", "error": 1e-3},
+        output={},
+        time={"step": STEP, "duration": 0.08},
+        gravity={"acceleration": [3, -2, -9]},
+        start={"spin": [2, 1, 3]},
+        obstacle=[box_at([[-2, -2, -0.5], [2, 2, -0.26]], response="barrier"), ball],
+        self_contact={"distance": 2e-3},
+    )
+    body = trimesh.creation.icosphere(2)
+    body.apply_scale([0.5, 0.375, 0.25])
+    body.export(folder / "scene.ply")
+    return scene
+
+
+def test_a_ball_pushes_a_free_body_over_a_floor(tmp_path: Path):
+    """Contact is stiff and light nodes are soft, so loose linear solves do not lead the ball on."""
+    model, frames = play(ball_beside_a_body(tmp_path))
+    assert not any(crossed(model, frame) for frame in frames)
+
+
 # on the second way the parts come so near that the barrier's Hessian is not finite
 @pytest.mark.parametrize("way", [[0, 0, -1.5], [1.7e-8, 0, -1.5000003]])
 def test_a_step_that_cannot_end_names_the_two_parts_that_meet(tmp_path: Path, way: list[float]):

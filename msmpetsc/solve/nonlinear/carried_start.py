@@ -25,6 +25,9 @@ from msmpetsc.errors import StepFailed, StepStopped
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 from msmpetsc.solve.nonlinear.jacobian import Jacobian
 
+# Greatest relative tolerance of a linear solve that moves anchors and obstacles [-];
+# stiff contact dominates its right-hand side, so soft modes need more digits
+MOVING_RTOL = 3e-5
 # Number of directions between checks of the progress; pressing a body takes 5 to 30
 PATIENCE = 20
 # Least progress in s between checks; with less progress the step is refused
@@ -107,9 +110,10 @@ class CarriedStart:
                     replace(problem, prescribed=problem.fixed_positions - left),
                 )
                 for _ in range(CORRECTIONS):
-                    direction = self._direction(q, np.zeros_like(left), still)
+                    direction = self._direction(q, np.zeros_like(left), still, self.rtol)
                     q = q + functional.collision_free_step(q, q + direction) * direction
-                direction = self._direction(q, left, contacts.obstacles.displacements(now, end))
+                onward = contacts.obstacles.displacements(now, end)
+                direction = self._direction(q, left, onward, min(self.rtol, MOVING_RTOL))
                 contacts.time = end
                 share = functional.collision_free_step(q, q + direction, now)
                 if share == 1.0:
@@ -124,11 +128,12 @@ class CarriedStart:
             "contact",
         )
 
-    def _direction(self, q: Positions, fixed: Rows, obstacles: Rows) -> Rows:
+    def _direction(self, q: Positions, fixed: Rows, obstacles: Rows, rtol: float) -> Rows:
         """Return Newton's direction (l, 3) [m] at q (l, 3) [m], fixed nodes included.
 
         fixed     : (l, 3) displacements of fixed nodes [m]
         obstacles : (o, 3) displacements of obstacles' points [m]
+        rtol      : relative tolerance of the linear solve
 
         Raises StepStopped after a signal.
         """
@@ -148,7 +153,7 @@ class CarriedStart:
         f.axpy(1.0, change)
         tolerances = self.ksp.getTolerances()
         self.ksp.setInitialGuessNonzero(False)
-        self.ksp.setTolerances(rtol=self.rtol, max_it=self.most_its)
+        self.ksp.setTolerances(rtol=rtol, max_it=self.most_its)
         self.ksp.solve(f, x)
         self.ksp.setTolerances(*tolerances)
         x.scale(-1.0)

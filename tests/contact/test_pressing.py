@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from block_scene import DENSITY, GRAVITY, SIDES, G, block_scene, box_at, play, solid_of
+from stopped_runs import assert_goes_on_exactly
 from test_obstacle_surfaces import crossed
 
 from msmpetsc.build import Model
@@ -149,6 +150,11 @@ def test_a_ball_pushes_a_free_body_over_a_floor(tmp_path: Path):
     """Contact is stiff and light nodes are soft, so loose linear solves do not lead the ball on."""
     model, frames = play(ball_beside_a_body(tmp_path))
     assert not any(crossed(model, frame) for frame in frames)
+
+
+def test_a_step_that_leads_a_ball_on_does_not_depend_on_earlier_steps(tmp_path: Path):
+    """The linear solves of its start do not end by the acceptable error of the last step."""
+    assert_goes_on_exactly(ball_beside_a_body(tmp_path), every=5)
 
 
 # on the second way the parts come so near that the barrier's Hessian is not finite

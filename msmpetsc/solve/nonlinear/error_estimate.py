@@ -95,11 +95,12 @@ class ErrorEstimate:
         self.operator.assemble()
 
     def begin_step(self, has_contact: bool) -> None:
-        """Forget the eigenvalues of the last step.
+        """Forget the eigenvalues and the acceptable error of the last step.
 
         has_contact : whether H has contact, whose small eigenvalues CG meets late
         """
         self.convexity, self._least = 1.0, 0.0 if has_contact else 1.0
+        self._acceptable = 0.0
 
     def begin(self, acceptable: float) -> None:
         """Begin a solve.

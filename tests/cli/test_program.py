@@ -62,6 +62,20 @@ def test_a_mistaken_command_is_told_all_commands(words: list[str], expected: str
     assert expected in command_error(*words)
 
 
+def test_a_mesh_for_a_scene_and_a_scene_for_a_study_name_the_command_that_takes_them(
+    tmp_path: Path,
+):
+    scene, mesh, study = block_scene(tmp_path), tmp_path / "scene.ply", tmp_path / "study.toml"
+    study.write_text('[[scene]]\nname = "a"\nfile = "a.toml"\n[[sweep]]\npreset = ["newton"]\n')
+    remedies = {
+        ("run", mesh): f"is a mesh, no scene: msmpetsc new {scene} --mesh {mesh}",
+        ("run", study): f"is a study, no scene: msmpetsc study {study}",
+        ("study", scene): f"is a scene, no study: msmpetsc run {scene}",
+    }
+    for (command, path), remedy in remedies.items():
+        assert f"{path}: {remedy}" in command_error(command, path)
+
+
 def test_steps_longer_than_the_slowest_vibration_are_warned_of(tmp_path: Path, capsys):
     """A step longer than the slowest vibration gives a warning.
 

@@ -36,6 +36,8 @@ ALPHA = 1e-4
 LEAST, MOST = 0.1, 0.5
 # Least step length [-]; along a rising direction g may seem to fall by rounding
 SHORTEST = 1e-6
+# Share of the slope that a direction must keep if bent at obstacles [-]
+DOWNHILL = 0.1
 # Collision-free step length [-] along a direction, below which the next iteration takes
 # the projected Hessian
 STUCK = 0.01
@@ -276,8 +278,8 @@ class Newton(StepMethod):
         """Bend y so that nodes stop at obstacles that they would enter.
 
         H at x lacks obstacles that nodes do not touch yet. If the line search shortened the whole
-        step for these nodes, they would come into contact one by one. If the bent direction does
-        not descend, y stays as it is.
+        step for these nodes, they would come into contact one by one. If the bent direction hardly
+        descends, y stays as it is.
 
         end : positions (l, 3) [m] at x - y
 
@@ -291,7 +293,7 @@ class Newton(StepMethod):
         # Fixed nodes stay at their places
         free = functional.positions(bent)
         bent.aypx(-1.0, now.x)
-        if not bent.dot(now.f) > 0:
+        if not bent.dot(now.f) > DOWNHILL * self.y.dot(now.f):
             return end
         bent.copy(self.y)
         return free

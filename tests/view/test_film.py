@@ -66,12 +66,18 @@ def test_the_film_of_a_third_of_a_second_says_how_much_slower_it_is():
     assert playback_of(np.arange(61.0)).words == "10 times faster than real"
 
 
-def test_a_film_lasts_some_seconds_and_says_its_speed(falling_ball, tmp_path, caplog):
+def test_a_film_fills_its_frame_and_says_its_speed(falling_ball, tmp_path, caplog):
+    """The ball's path is four times as high as wide, and so is the film without its caption."""
     with caplog.at_level("INFO", logger="msmpetsc"):
         render(falling_ball, "-o", tmp_path / "x.gif")
     with Image.open(tmp_path / "x.gif") as film:
         seconds = sum(picture.info["duration"] for picture in ImageSequence.Iterator(film)) / 1000
     assert 3 <= seconds <= 8 and "5 times slower than real" in caplog.text
+    pictures = np.array(pictures_of(tmp_path / "x.gif"))[:, :-CAPTION]
+    assert pictures.shape[1] > 1.5 * pictures.shape[2]
+    body = (pictures[..., 2] - pictures[..., 0] > 15).any(axis=0)
+    rows = np.flatnonzero(body.any(axis=1))
+    assert np.ptp(rows) > 0.75 * pictures.shape[1]
 
 
 def test_slow_motion_shows_all_frames_for_longer(falling_ball, tmp_path):

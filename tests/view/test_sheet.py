@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from ball_result import BARE, EAST_HELD, HEIGHTS, LED, write_ball
 from conftest import ROOT, python
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from msmpetsc.errors import InputError
 from msmpetsc.results.reader import Result
@@ -279,6 +279,21 @@ def test_many_panels_stand_in_rows_and_each_is_shown(falling_ball, tmp_path):
     each = [part for row in np.split(drawn, 2) for part in np.split(row, 6, axis=1)]
     assert all(is_body(panel).any() for panel in each[:11]) and (each[11] == 255).all()
     assert body_rows(each[3])[0] > body_rows(each[2])[0] > body_rows(each[0])[0] > 0
+
+
+def test_all_that_is_written_is_in_one_typeface(falling_ball, tmp_path, monkeypatch):
+    """Captions and the legend use the same typeface."""
+    written, draw = {}, ImageDraw.ImageDraw.text
+
+    def recorded(self, at, text, fill=None, font=None, **options):
+        written[text] = font.getname()[0]
+        draw(self, at, text, fill, font, **options)
+
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", recorded)
+    style = Style(colour="displacement")
+    sheet.contact_sheet(falling_ball, tmp_path / "x.png", frames=[0], style=style)
+    assert set(written.values()) == {"DejaVu Sans"}
+    assert {"displacement", "t"} <= {text.partition(" ")[0] for text in written}
 
 
 def test_a_black_picture_is_no_picture(falling_ball, tmp_path, monkeypatch):

@@ -99,6 +99,7 @@ def test_what_cannot_be_checked_is_refused_in_one_line(scene: Path, numbers: Pat
     tiny = ("--set", "cages={cell_size=0.125, max_cells=1}")
     refused = {
         "nothing is stored of": ["check", str(other)],
+        "no such scene file": ["check", str(tmp_path / "absent.toml")],
         "are for --update": ["check", str(scene), "--cells", "30"],
         "time.error": ["check", "--update", str(other)],
         "--frames must be at least 1": ["check", "--update", str(other), "--frames", "0"],

@@ -104,6 +104,8 @@ def check(files: Mapping[Path, Path], ranks: int, as_json: bool) -> dict[str, li
     """Compare scenes with their stored numbers; print and return the differences by scene."""
     for scene, file in files.items():
         if not file.is_file():
+            # a scene that is not there has nothing to store
+            load_scene(scene, by_user=False)
             raise InputError(
                 f"nothing is stored of {scene}: "
                 f"msmpetsc check --update {quote(str(scene))} stores {file}"

@@ -90,11 +90,14 @@ def test_an_obstacle_presses(tmp_path: Path):
     assert 1e3 * depth.sum() == pytest.approx(along * (0.01 - depth.mean()), rel=0.03)
 
 
-POINT = {"pin": [{"region": {"box": [[-0.01, -0.01, -0.01], [0.01, 0.01, 0.01]]}}]}
+POINT, EDGE = (
+    {"pin": [{"region": {"box": [[-0.01, -0.01, -0.01], [0.01, 0.01, top]]}}]} for top in (0.01, 9)
+)
+ON_A_LINE = "held at a point or on a line"
 
 
 @pytest.mark.parametrize(
-    "tables, words", [({}, "held by nothing"), (POINT, "held at a point or two")]
+    "tables, words", [({}, "held by nothing"), (POINT, ON_A_LINE), (EDGE, ON_A_LINE)]
 )
 def test_a_body_that_may_turn_or_move_is_refused(tmp_path: Path, tables: dict, words: str):
     scene = column(tmp_path, gravity={"acceleration": [0.0, 0.0, -0.1]}, **tables)

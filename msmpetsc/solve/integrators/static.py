@@ -213,6 +213,16 @@ def _rigid_rank(unknowns: Unknowns, fixed: Mask) -> int:
     return int(np.linalg.matrix_rank(rows))
 
 
+def _are_on_a_line(unknowns: Unknowns, where: Mask) -> bool:
+    """Return whether the nodes of a mask (owned,) at rest are on a line (collective)."""
+    x = to_host(unknowns.lattice.nodes)[np.flatnonzero(where)] / unknowns.lattice.cell_size
+    total = reduced(unknowns.comm, np.append(x.sum(axis=0), len(x)))
+    x = x - total[:3] / max(total[3], 1.0)
+    squares = np.linalg.eigvalsh(reduced(unknowns.comm, x.T @ x))
+    # a node beside the line is at least half a cell away from it
+    return bool(squares[1] < 0.1)
+
+
 def time_of_sound(lattice: Lattice) -> float:
     """Return about the travel time [s] of sound along the longest side (collective)."""
     if lattice.solid is None:
@@ -226,19 +236,23 @@ def time_of_sound(lattice: Lattice) -> float:
 
 
 def refuse_free_bodies(unknowns: Unknowns) -> None:
-    """Raise InputError if a body can move as a whole, freely or about a few points (collective).
+    """Raise InputError if a body can move as a whole, freely or about a line (collective).
 
     A part that no spring or cell joins with the rest counts as a body.
     """
     bodies, lattice = bodies_of(unknowns), unknowns.lattice
-    support = "held at a point or two, about which it turns"
+    support = "held at a point or on a line, about which it turns"
     free = bodies.free.any(axis=1)
     fixed = to_host(lattice.fixed[: lattice.owned])
     count = reduced(unknowns.comm, int(fixed.sum()))
     if free.any():
         along = [axis for axis, moves in zip("xyz", bodies.free[free][0], strict=True) if moves]
         support = f"held by nothing along {', '.join(along)}"
-    elif count > 6 or _rigid_rank(unknowns, fixed) == 6:
+    elif not (
+        _are_on_a_line(unknowns, fixed.any(axis=1))
+        if count > 6
+        else _rigid_rank(unknowns, fixed) < 6
+    ):
         return
     subject = "the body"
     if len(bodies.free) > 1:

@@ -201,21 +201,21 @@ def build_model(
     own_materials = [body.material for body in scene.body]
     materials = cell_materials(scene.material, own_materials, scene.tables("part"), finder)
     lattice = build_lattice(cages, scene.material, materials, geometry.topology)
-    held = [*scene.tables(*HOLDERS)]
-    tables = [*held, *scene.tables("force")]
+    pins, leading, forces = ([*scene.tables(kind)] for kind in (*HOLDERS, "force"))
+    held, tables = [*pins, *leading], [*pins, *leading, *forces]
     own = NodePoints(lattice.nodes, np.zeros(len(lattice.nodes), bool))
     nearest = geometry.nearest if tables else own
     masks = {table.key: finder.find(table, lattice, nearest) for table in tables}
     components = {t.key: masks[t.key][:, None] & np.array(t.table.fixed) for t in held}
     lattice = lattice.pin(
-        reduce(np.logical_or, (components[pin.key] for pin in scene.tables("pin")), lattice.fixed)
+        reduce(np.logical_or, (components[pin.key] for pin in pins), lattice.fixed)
     )
     holders = Holders.of_masks(components, lattice)
-    anchors = _anchors(scene.tables("anchor"), lattice, components, holders)
+    anchors = _anchors(leading, lattice, components, holders)
     fixed = reduce(np.logical_or, (anchor.where for anchor in anchors), lattice.fixed)
     outside = geometry.outside(lattice.nodes) if scene.obstacle else None
     obstacles = build_obstacles(comm, scene.obstacle, scene.folder, lattice, outside)
-    loads, own_forces = _loads(comm, scene.gravity, scene.tables("force"), lattice, masks)
+    loads, own_forces = _loads(comm, scene.gravity, forces, lattice, masks)
     areas, pressures = _surface_loads(scene.tables(*SURFACE_LOADS), finder, lattice)
     loads += areas
     lattice = replace(lattice, pressed=tuple(pressure.part for pressure in pressures))
@@ -235,7 +235,7 @@ def build_model(
         start=initial_state(comm, scene.starts, lattice, fixed, finder.bounds, read_state),
         bodies=bodies,
         collision=collision_surface(scene, bodies, cages, lattice, obstacles),
-        node_counts=taken(comm, tables, lattice, anchors, masks),
+        node_counts=taken(comm, (pins, leading, forces), lattice, anchors, masks),
         damping=scene.material.damping,
         retardation=scene.material.retardation_time,
         obstacles=tuple(obstacles),

@@ -3,6 +3,7 @@
 import difflib
 from collections.abc import Iterable
 from errno import EDQUOT, EFBIG, ENOSPC
+from pathlib import Path
 
 # exit statuses of the command line; app.signals has the statuses of stopped runs
 STATUS_BUG, STATUS_REFUSED, STATUS_FAILED, STATUS_INTERRUPTED = 1, 2, 3, 130
@@ -93,6 +94,12 @@ def extra_of(module: str, first: str = "run") -> str | None:
     """Return the extra that brings a module, ``first`` if it does; None for an unknown module."""
     package = module.partition(".")[0]
     return next((extra for extra in (first, *EXTRAS) if package in EXTRAS[extra]), None)
+
+
+def refuse_pipe(path: Path) -> None:
+    """Raise InputError for a pipe or a device, which may have no end."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise InputError(f"{path} is a pipe or a device, not a file")
 
 
 def did_you_mean(name: str, valid: Iterable[str]) -> str:

@@ -29,7 +29,7 @@ from msmpetsc.constraints.anchors import Anchor
 from msmpetsc.errors import InputError
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.region import Finder
-from msmpetsc.scene.motion import AnchorTable, Force, Pin
+from msmpetsc.scene.motion import Pin
 from msmpetsc.scene.schema import OfBody
 
 # least free fraction theta of a spring [-]; stiff springs cost iterations and substeps
@@ -185,7 +185,7 @@ def _free_fraction(within: Within, start: Positions, end: Positions) -> Floats:
 
 def taken(
     comm: MPI.Comm,
-    tables: Sequence[OfBody],
+    tables: tuple[Sequence[OfBody], Sequence[OfBody], Sequence[OfBody]],
     lattice: Lattice,
     anchors: list[Anchor],
     masks: Regions,
@@ -205,10 +205,7 @@ def taken(
     def count(where: Mask) -> int:
         return int(comm.allreduce(int(where[: lattice.owned].sum())))
 
-    pins, leading, forces = (
-        [table for table in tables if isinstance(table.table, kind)]
-        for kind in (Pin, AnchorTable, Force)
-    )
+    pins, leading, forces = tables
     words = [
         f"{table.key} holds {', '.join(table.table.fix)} of {count(masks[table.key])} nodes"
         for table in pins

@@ -118,6 +118,6 @@ def _next_guess(excess: dict[float, float], nearest: float) -> float:
         return guess
     if np.isfinite(low + high):
         return (low + high) / 2
-    # all sizes are on one side of the root: go beyond the outermost
+    # all sizes are too small, or all are too large: go beyond the outermost size
     outermost = high if np.isfinite(high) else low
     return outermost - excess[outermost] / slope

@@ -17,7 +17,7 @@ from trimesh.resolvers import FilePathResolver
 
 from msmpetsc.backend.arrays import Array, Indices, Positions
 from msmpetsc.comm import starts
-from msmpetsc.errors import InputError, one_line
+from msmpetsc.errors import InputError, one_line, refuse_pipe
 from msmpetsc.geometry.cell_meshes import labels_of, read_cells
 from msmpetsc.geometry.surface import Surface, compact
 
@@ -89,9 +89,7 @@ def _kind(path: Path) -> str:
 
 def _content(path: Path) -> bytes:
     """Return the bytes of a file. Raises InputError if it cannot be read or is empty."""
-    # a pipe or a device may have no end
-    if path.exists() and not (path.is_file() or path.is_dir()):
-        raise InputError(f"{path}: is a pipe or a device, not a file")
+    refuse_pipe(path)
     try:
         data = path.read_bytes()
     except (OSError, MemoryError) as error:

@@ -142,7 +142,7 @@ def touched_cells(corners: Rows, low: Indices, high: Indices) -> tuple[Indices, 
 
 
 def cells_below(cells: Indices, is_inside: Mask) -> Indices:
-    """Return the cells (n, 3) in the gaps of columns (i, j), below those cells that are marked.
+    """Return the cells (n, 3) in the gaps of columns (i, j) below marked cells.
 
     cells     : (c, 3), in lexicographic order
     is_inside : (c,) whether the gap below each cell, down to the next cell, is inside the body

@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from msmpetsc.errors import InputError, one_line
+from msmpetsc.errors import InputError, one_line, refuse_pipe
 
 
 @contextmanager
@@ -49,8 +49,7 @@ def refuse_no_file(path: Path) -> None:
     """Raise InputError if the path is a folder, a pipe or a device."""
     if path.is_dir():
         raise InputError(f"{path} is a folder, not a file")
-    if path.exists() and not path.is_file():
-        raise InputError(f"{path} is a pipe or a device, not a file")
+    refuse_pipe(path)
 
 
 def refuse_existing(path: Path, overwrite: bool) -> None:

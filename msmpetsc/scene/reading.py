@@ -11,7 +11,7 @@ from typing import Any
 import tomli_w
 from pydantic import Field, ValidationError
 
-from msmpetsc.errors import InputError
+from msmpetsc.errors import InputError, refuse_pipe
 from msmpetsc.scene.problems import as_given, problem_lines
 from msmpetsc.scene.schema import SceneFile
 from msmpetsc.scene.toml import overrides_of, plain
@@ -189,9 +189,7 @@ def lies_below(folder: Path, name: str) -> bool:
 
 def _read(path: Path, kind: str) -> str:
     """Return the text of a file. Raises InputError that calls it a ``kind`` file."""
-    # a pipe or a device may have no end
-    if path.exists() and not (path.is_file() or path.is_dir()):
-        raise InputError(f"{path}: is a pipe or a device, not a {kind} file")
+    refuse_pipe(path)
     try:
         # -sig drops a byte order mark, which some editors write
         return path.read_text("utf-8-sig")

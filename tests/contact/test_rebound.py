@@ -105,7 +105,7 @@ BOUNCES = {
 
 @pytest.mark.parametrize("name", BOUNCES)
 def test_bdf2_bounces_off_a_moving_ground_as_off_one_at_rest(tmp_path: Path, name: str):
-    """The energy balance moves with the ground, so it shows the same gains and no others."""
+    """The energy balance moves with the ground, so it shows the same gains as at rest."""
     flights, (sides, ground, velocity, step, tables) = [], BOUNCES[name]
     for wind in np.zeros(3), np.array([0.0, 0.0, -20.0]):
         scene = block_scene(

@@ -1,4 +1,4 @@
-"""Volumes of cells, and steps of a squeezed solid by all presets."""
+"""Volumes of cells, and cells that are inside out, which a neo-Hookean solid turns back."""
 
 import numpy as np
 import pytest
@@ -15,9 +15,10 @@ from msmpetsc.solve.presets import PRESETS, find_preset
 H = 0.1
 
 
-def lattice_of(*sides: int) -> Lattice:
-    material = Material(density=DENSITY, young_modulus=YOUNG, law="neo-hookean")
-    return build_lattice(cages_of(block(*sides), H), material)
+def lattice_of(*sides: int, law: str = "neo-hookean") -> Lattice:
+    return build_lattice(
+        cages_of(block(*sides), H), Material(density=DENSITY, young_modulus=YOUNG, law=law)
+    )
 
 
 def test_volumes_at_rest_and_mirrored():
@@ -48,6 +49,49 @@ def test_a_corner_pushed_through_its_cell_makes_its_volume_least(corner: int):
     q[cell[corner]] += 0.8 * inwards
     # det(I - 0.8 * ones) = 1 - 3 * 0.8
     np.testing.assert_allclose(least_volumes(q, one.local_cells), 1 - 2.4, rtol=1e-12)
+
+
+def after_many_steps(lattice: Lattice, start: np.ndarray) -> np.ndarray:
+    """Return the positions (n, 3) [m] after 150 damped steps from rest at ``start``."""
+    stepper = Stepper(COMM, lattice, T, find_preset("newton"), error=1e-4)
+    q = before = start
+    try:
+        for _ in range(150):
+            q, before = stepper.step(StepProblem(q, 2 * q - before, np.zeros_like(q))).position, q
+    finally:
+        stepper.destroy()
+    return q
+
+
+def test_a_cell_folded_into_its_neighbour_comes_back_as_a_solid_and_stays_as_springs():
+    """A cell folded into its neighbour unfolds as a solid and stays folded as springs.
+
+    The end of a bar is pushed through the last cell's inner face. The mirrored cell has all its
+    springs at rest length, so Hooke's law resists nothing.
+    """
+    bar = lattice_of(3, 1, 1)
+    start = bar.nodes + 0.02 * H * np.random.default_rng(7).normal(size=bar.nodes.shape)
+    start[np.isclose(bar.nodes[:, 0], bar.nodes[:, 0].min()), 0] += 1.5 * H
+    assert least_volumes(start, bar.local_cells).min() < 0
+    back = after_many_steps(bar, start)
+    stuck = after_many_steps(lattice_of(3, 1, 1, law="linear"), start)
+    np.testing.assert_allclose(least_volumes(back, bar.local_cells), H**3, rtol=1e-3)
+    np.testing.assert_allclose(
+        np.sort(least_volumes(stuck, bar.local_cells)), [-(H**3), H**3, H**3], rtol=1e-3
+    )
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_mirrored_cell_unfolds_without_a_step_that_fails(seed: int):
+    """The Hessian of the cell is indefinite, so newton must leave the projected Hessian."""
+    one = lattice_of(1, 1, 1)
+    start = one.nodes * [1, 1, -1] + 0.05 * H * np.random.default_rng(seed).normal(
+        size=one.nodes.shape
+    )
+    end = after_many_steps(one, start)
+    assert (
+        least_volumes(start, one.local_cells).max() < 0 < least_volumes(end, one.local_cells).min()
+    )
 
 
 def squeezed_step(

@@ -202,25 +202,17 @@ class Static(ImplicitEuler):
         return result, path
 
 
-def _rigid_rank(unknowns: Unknowns, fixed: Mask) -> int:
-    """Return the number of rigid motions that fixed components (owned, 3) prevent (collective)."""
+def _prevents_rigid_motion(unknowns: Unknowns, fixed: Mask) -> bool:
+    """Return whether fixed components (owned, 3) prevent all six rigid motions (collective)."""
     lattice = unknowns.lattice
     node, component = np.nonzero(fixed)
     x = to_host(lattice.nodes)[node] / lattice.cell_size
+    total = reduced(unknowns.comm, np.append(x.sum(axis=0), len(x)))
+    x -= total[:3] / max(total[3], 1.0)
     # rotations about each axis, along the component
     turns = np.cross(np.eye(3), x[:, None])[np.arange(len(node)), :, component]
-    rows = np.concatenate(unknowns.comm.allgather(np.hstack([np.eye(3)[component], turns])))
-    return int(np.linalg.matrix_rank(rows))
-
-
-def _are_on_a_line(unknowns: Unknowns, where: Mask) -> bool:
-    """Return whether the nodes of a mask (owned,) at rest are on a line (collective)."""
-    x = to_host(unknowns.lattice.nodes)[np.flatnonzero(where)] / unknowns.lattice.cell_size
-    total = reduced(unknowns.comm, np.append(x.sum(axis=0), len(x)))
-    x = x - total[:3] / max(total[3], 1.0)
-    squares = np.linalg.eigvalsh(reduced(unknowns.comm, x.T @ x))
-    # a node beside the line is at least half a cell away from it
-    return bool(squares[1] < 0.1)
+    motions = np.hstack([np.eye(3)[component], turns])
+    return bool(np.linalg.matrix_rank(reduced(unknowns.comm, motions.T @ motions)) == 6)
 
 
 def time_of_sound(lattice: Lattice) -> float:
@@ -244,15 +236,13 @@ def refuse_free_bodies(unknowns: Unknowns) -> None:
     support = "held at a point or on a line, about which it turns"
     free = bodies.free.any(axis=1)
     fixed = to_host(lattice.fixed[: lattice.owned])
-    count = reduced(unknowns.comm, int(fixed.sum()))
+    if reduced(unknowns.comm, int(fixed.sum())) > 6:
+        # many rollers may leave a rotation free; only nodes on a line are refused
+        fixed = np.repeat(fixed.any(axis=1)[:, None], 3, axis=1)
     if free.any():
         along = [axis for axis, moves in zip("xyz", bodies.free[free][0], strict=True) if moves]
         support = f"held by nothing along {', '.join(along)}"
-    elif not (
-        _are_on_a_line(unknowns, fixed.any(axis=1))
-        if count > 6
-        else _rigid_rank(unknowns, fixed) < 6
-    ):
+    elif _prevents_rigid_motion(unknowns, fixed):
         return
     subject = "the body"
     if len(bodies.free) > 1:

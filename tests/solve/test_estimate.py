@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -15,7 +16,10 @@ from petsc4py import PETSc
 from msmpetsc.backend.arrays import Rows
 from msmpetsc.solve.instrumentation import true_errors
 from msmpetsc.solve.nonlinear import error_control
-from msmpetsc.solve.nonlinear.functional import StepProblem
+from msmpetsc.solve.nonlinear.error_control import Outcome
+from msmpetsc.solve.nonlinear.functional import Iterate, StepProblem
+from msmpetsc.solve.nonlinear.newton import Newton
+from msmpetsc.solve.nonlinear.preconditioning import LatticePreconditioner
 from msmpetsc.solve.nonlinear.step import Stepper, StepResult
 from msmpetsc.solve.presets import PRESETS, find_preset
 
@@ -88,6 +92,35 @@ def test_with_multigrid_a_proof_is_cheap(tmp_path: Path, law: str):
         sum(getattr(frame, name) for frame in frames) for name in ("proof_products", "products")
     )
     assert 0 < proof < 0.45 * products
+
+
+def test_the_age_of_a_hierarchy_counts_the_digits_that_its_solves_reached(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """A solve ends early once the error is acceptable; its tolerance then says nothing."""
+    told: list[float] = []
+    learn, solve = LatticePreconditioner.learn, Newton._solve
+    monkeypatch.setattr(
+        LatticePreconditioner,
+        "learn",
+        lambda self, its, reached: (told.append(reached), learn(self, its, reached)),
+    )
+    ratios: list[float] = []
+
+    def solved(self: Newton, now: Iterate, *given: Any) -> Outcome:
+        outcome = solve(self, now, *given)
+        z = now.f.duplicate()
+        self.jacobian.preconditioner.apply(None, now.f, z)
+        ratios.append(self.ksp.getResidualNorm() / np.sqrt(z.dot(now.f)))
+        return outcome
+
+    monkeypatch.setattr(Newton, "_solve", solved)
+    path = block_scene(tmp_path, gravity=GRAVITY, **SCENES["swings"])
+    with loop_of(path, "solver={preset='newton-multigrid', error=0.01}") as simulation:
+        tolerance = simulation.integrator.stepper.control.rtol
+        list(simulation.frames())
+    assert told == pytest.approx(ratios, rel=1e-6)
+    assert max(told) > 3 * tolerance
 
 
 def test_newtons_linear_solves_tell_the_error(tmp_path: Path):

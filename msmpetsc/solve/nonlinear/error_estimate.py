@@ -41,6 +41,7 @@ class ErrorEstimate:
     lowest          : lower bound of the eigenvalues of M^(-1) H that the last estimate used
     convexity       : least eigenvalue of M^(-1) H that the step has met, at most 1
     is_accepted     : whether the last solve has shown that the error is acceptable
+    reached         : |r_k| / |F|, in the norm of P^-1, of Newton's last solve
     products        : number of products with H in all estimates so far, multigrid's finest level
                       included
     """
@@ -60,6 +61,7 @@ class ErrorEstimate:
         self.lowest = self.convexity = 1.0
         self.is_accepted = False
         self._acceptable = self._first = 0.0
+        self.reached = 1.0
         # Least eigenvalue of P^(-1) H that the step has met, at most 1; 0 with contact
         self._least = 1.0
         self.ksp = PETSc.KSP().create(functional.comm)
@@ -116,7 +118,8 @@ class ErrorEstimate:
             return reasons.DIVERGED_NANORINF
         if its == 0:
             self._first = residual
-        elif self._acceptable > 0 and self._accepts_met(ksp, residual):
+        self.reached = residual / self._first if self._first > 0 else 1.0
+        if its > 0 and self._acceptable > 0 and self._accepts_met(ksp, residual):
             return reasons.CONVERGED_HAPPY_BREAKDOWN
         if residual <= atol:
             return reasons.CONVERGED_ATOL

@@ -68,8 +68,8 @@ class StepPreconditioner:
         """
         return None
 
-    def learn(self, its: int, rtol: float) -> None:
-        """Count the iterations of a linear solve to a relative tolerance."""
+    def learn(self, its: int, reached: float) -> None:
+        """Count the iterations of a linear solve that reduced its residual to ``reached`` [-]."""
 
     def forget(self) -> None:
         """Forget data of earlier steps."""
@@ -228,15 +228,15 @@ class LatticePreconditioner(StepPreconditioner):
             return None
         return int(self.rate * _digits(rtol) + PATIENCE - self.excess)
 
-    def learn(self, its: int, rtol: float) -> None:
-        """Count the iterations of a linear solve to a relative tolerance.
+    def learn(self, its: int, reached: float) -> None:
+        """Count the iterations of a linear solve that reduced its residual to ``reached`` [-].
 
         A hierarchy is kept until its excess iterations have cost as much as a new hierarchy. So the
         total cost is at most twice the least possible cost.
         """
         if its == 0:
             return
-        digits = _digits(rtol)
+        digits = _digits(reached)
         if self.rate is None:
             self.rate = its / digits
         self.excess += max(its - self.rate * digits, 0.0)
@@ -297,6 +297,6 @@ class LatticePreconditioner(StepPreconditioner):
         self.multigrid.destroy()
 
 
-def _digits(rtol: float) -> float:
-    """Return the number of digits that a solve to a relative tolerance gains, at least 0.1."""
-    return max(-float(np.log10(rtol)), 0.1)
+def _digits(reached: float) -> float:
+    """Return the number of digits in a reduction of the residual to ``reached``, at least 0.1."""
+    return max(-float(np.log10(max(reached, np.finfo(float).eps))), 0.1)

@@ -299,7 +299,10 @@ class EnergyBalance:
         # Explicit steps count the work of loads in StepResult.
         if not result.explicit:
             loads = environment.forces.mean(time - time_step, time)
-            work = np.vdot(loads.force, ended[0] - q[owned] - shift)
+            # Damping is a loss, and in a moving frame also the uniform force per mass
+            # -alpha times the frame's velocity.
+            uniform = environment.damping * lattice.mass[:, None] * drift
+            work = np.vdot(loads.force - uniform, ended[0] - q[owned] - shift)
             work -= loads.pressures.change(result.position, q)
         sums = self._sums(
             0.5 * np.vdot(lattice.mass[:, None] * free * (v - drift), v - drift),

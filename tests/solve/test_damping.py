@@ -43,11 +43,14 @@ def test_free_flight_decays_by_each_schemes_own_formula(tmp_path: Path):
     )
 
 
-def test_bdf2_converges_to_the_exponential_with_second_order(tmp_path: Path):
-    errors = []
+@pytest.mark.parametrize("gravity", [0.0, -9.81], ids=["free", "falling"])
+def test_bdf2_converges_to_the_exponential_with_second_order(tmp_path: Path, gravity: float):
+    errors, limit = [], gravity / ALPHA
+    exact = limit + (SPEED[2] - limit) * np.exp(-ALPHA * 0.25)
+    tables = {"start": {"velocity": SPEED}, "gravity": {"acceleration": [0, 0, gravity]}}
     for count in (8, 16, 32):
-        path = damped(tmp_path, "bdf2", count, step=0.25 / count, start={"velocity": SPEED})
-        errors.append(abs(velocities(path)[-1][2] + np.exp(-ALPHA * 0.25)))
+        path = damped(tmp_path, "bdf2", count, step=0.25 / count, **tables)
+        errors.append(abs(velocities(path)[-1][2] - exact))
     slopes = np.log2(np.array(errors[:-1]) / errors[1:])
     assert (slopes > 1.7).all() and errors[-1] < 1e-3, (errors, slopes)
 

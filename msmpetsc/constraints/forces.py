@@ -141,6 +141,7 @@ class ActingForces:
         self.pressures = pressures
         self.all: list[Varying] = [*loads, *own_forces, *pressures]
         self._own = [np.zeros((0, 3))] * len(own_forces)
+        self._own_means = self._own.copy()
 
     def begin_step(
         self,
@@ -168,7 +169,9 @@ class ActingForces:
 
         for number, force in enumerate(self.own_forces):
             now = own(force, q, v, time)
-            self._own[number] = now if earlier is None else 2 * now - own(force, *earlier)
+            change = 0.0 if earlier is None else now - own(force, *earlier)
+            self._own[number] = now + change
+            self._own_means[number] = now + 0.5 * change
 
     def at(self, time: float, users: bool = True) -> ExternalForces:
         """Return the external forces at a time [s].
@@ -177,9 +180,13 @@ class ActingForces:
         """
         return self._with(lambda load: load.state_at(time), users)
 
-    def mean(self, begin: float, end: float) -> ExternalForces:
-        """Return the means of the external forces from begin to end [s]."""
-        return self._with(lambda load: load.mean(begin, end))
+    def mean(self, begin: float, end: float, through: bool = False) -> ExternalForces:
+        """Return the means of the external forces from begin to end [s].
+
+        through : whether extrapolated users' functions are taken as means, too, for their work;
+                  otherwise they have their value at the end, as in the step
+        """
+        return self._with(lambda load: load.mean(begin, end), through=through)
 
     def ahead(self, before: float, begin: float, end: float) -> ExternalForces:
         """Return (3 f - f') / 2: f is the mean from begin to end, f' from before to begin [s]."""
@@ -190,12 +197,15 @@ class ActingForces:
 
         return self._with(total)
 
-    def _with(self, total: Callable[[Varying], Floats], users: bool = True) -> ExternalForces:
+    def _with(
+        self, total: Callable[[Varying], Floats], users: bool = True, through: bool = False
+    ) -> ExternalForces:
         """Return the external forces, with ``total(load)`` as the total of each load."""
         force = np.zeros((self.lattice.owned, 3), like=self.lattice.nodes)
         for load in self.loads:
             force += load.share * like(load.share, total(load))
-        for function, own in zip(self.own_forces, self._own, strict=True):
+        own_values = self._own_means if through else self._own
+        for function, own in zip(self.own_forces, own_values, strict=True):
             share = float(total(function)[0])
             if users and share and len(own):
                 force = force + share * own

@@ -91,6 +91,21 @@ def test_its_work_is_no_energy_from_nowhere(tmp_path: Path, caplog: pytest.LogCa
     assert "nowhere" not in caplog.text
 
 
+def test_bdf2_counts_the_work_of_a_force_through_its_steps(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    """A block starts at the centre of a spring and oscillates once."""
+    start: dict[str, np.ndarray] = {}
+    msm.register_force("spring", lambda x, v, t: RATE**2 * (start.setdefault("x", x.copy()) - x))
+    time = {"integrator": "bdf2"}
+    frames = list(msm.frames(flying(tmp_path, "spring", 158, STEP / 2, time=time)))
+    energy = frames[0].kinetic
+    assert min(frame.kinetic for frame in frames) < 1e-3 * energy
+    assert frames[-1].kinetic == pytest.approx(energy, rel=0.05)
+    assert sum(frame.energy_gained for frame in frames) < 5e-3 * energy
+    assert "nowhere" not in caplog.text
+
+
 def test_it_acts_on_its_region_and_in_its_time(tmp_path: Path):
     seen = []
 

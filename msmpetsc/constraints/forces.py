@@ -113,10 +113,12 @@ class ExternalForces(NamedTuple):
 
     force     : (owned, 3) [N] that do not depend on positions
     pressures : pressures, whose forces follow the surface
+    totals    : total of each load of ``ActingForces.loads``
     """
 
     force: Rows
     pressures: Pressures
+    totals: list[Floats]
 
     def at(self, q: Positions) -> Rows:
         """Return the force f_ext (owned, 3) [N] at positions q (l, 3) [m] (collective)."""
@@ -202,12 +204,13 @@ class ActingForces:
     ) -> ExternalForces:
         """Return the external forces, with ``total(load)`` as the total of each load."""
         force = np.zeros((self.lattice.owned, 3), like=self.lattice.nodes)
-        for load in self.loads:
-            force += load.share * like(load.share, total(load))
+        totals = [total(load) for load in self.loads]
+        for load, value in zip(self.loads, totals, strict=True):
+            force += load.share * like(load.share, value)
         own_values = self._own_means if through else self._own
         for function, own in zip(self.own_forces, own_values, strict=True):
             share = float(total(function)[0])
             if users and share and len(own):
                 force = force + share * own
         values = [float(total(pressure)[0]) for pressure in self.pressures]
-        return ExternalForces(force, Pressures([p.part for p in self.pressures], values))
+        return ExternalForces(force, Pressures([p.part for p in self.pressures], values), totals)

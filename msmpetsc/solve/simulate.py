@@ -347,8 +347,9 @@ class Forces:
     """Compute the force fields of a frame (fields.Frame) that the scene needs.
 
     The fields are loads, reactions of pins and anchors, and contact forces of obstacles and of the
-    surface. The last implicit step gives inertia and friction. At the start and in explicit steps,
-    reactions leave out inertia, and contact forces leave out friction.
+    surface. The last implicit step gives loads, inertia and friction. At the start and in explicit
+    steps loads are those of the time, reactions leave out inertia, and contact forces leave out
+    friction.
 
     rows : name of a field -> number of its rows
     """
@@ -382,11 +383,16 @@ class Forces:
         contact = step.contact if step else None
         if contact is None:
             contact = environment.push(q, time, sides)
-        loads = environment.forces.at(time)
+        # A step takes means of loads, so they balance its reactions.
+        loads = step.load if step and step.load else environment.forces.at(time)
         load = loads.at(q)
         sums = {"load": to_host(load.sum(axis=0)), **self._pushes(q, contact)}
         if "surface_load" in self.rows:
-            dead = [float(load.share.sum()) * load.state_at(time) for load in self.tractions]
+            totals = loads.totals[len(loads.totals) - len(self.tractions) :]
+            dead = [
+                float(load.share.sum()) * total
+                for load, total in zip(self.tractions, totals, strict=True)
+            ]
             sums["surface_load"] = np.array([*dead, *loads.pressures.resultants(q)])
         if "reaction" in self.rows:
             fixed = environment.anchors.fixed_at(time)[:owned]

@@ -70,6 +70,40 @@ def test_forces_add_up_to_mass_times_acceleration(tmp_path, integrator, damping,
 
 
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
+def test_forces_add_up_while_loads_change(tmp_path, integrator):
+    """A force, a traction and a pressure begin, bend and end within steps, also on held nodes."""
+    closed = {"box": [[-1, -1, -1], [1, 1, 1]]}
+    bend = {"start": 0.004, "stop": 0.038}
+    times = {"times": [0.0, 0.013, 0.04]}
+    scene = block_scene(
+        tmp_path, **TIGHT, material=SOLID, pin=[{"region": BOTTOM}],
+        time={"step": 0.01, "duration": 0.04, "integrator": integrator},
+        force=[{"region": closed,
+                "total": times | {"values": [[0, 0, 0], [200, 0, 300], [0, 0, 0]]}} | bend],
+        traction=[{"region": {"box": [[-1, -1, 0.24], [1, 1, 0.26]]},
+                   "value": times | {"values": [[0, 0, 0], [0, 800, 0], [0, 0, 0]]}} | bend],
+        pressure=[{"region": closed, "value": times | {"values": [0, 1e3, 0]}} | bend],
+    )  # fmt: skip
+    model, frames = play(scene)
+    p = [frame.momentum for frame in frames]
+    if integrator == "implicit-euler":
+        rates = [(b - a) / 0.01 for a, b in pairwise(p)]
+    else:
+        # the acceleration of BDF2's third step uses two earlier steps
+        rates = [None, None, *((3 * p[n] - 4 * p[n - 1] + p[n - 2]) / 0.02 for n in (3, 4))]
+    for frame, rate in zip(frames[1:], rates, strict=True):
+        if rate is not None:
+            assert totals(frame) == pytest.approx(rate, abs=1e-6)
+    # a closed pressure has no resultant
+    weight = model.lattice.mass.sum() * np.array(G)
+    ramp = frames[1].load - weight - frames[1].surface_load[0]
+    # mean over the step of a ramp from 0.004 s on
+    mean = 0.006 * (0.004 + 0.01) / 2 / 0.013 / 0.01
+    assert ramp == pytest.approx(mean * np.array([200, 0, 300]), abs=1e-6)
+    assert frames[1].surface_load[0] == pytest.approx([0, mean * 200, 0], abs=1e-6)
+
+
+@pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
 def test_frames_within_a_chosen_step_have_no_inertia_of_its_end(tmp_path, integrator):
     """A body that flies along with its anchor needs no force, also in frames within long steps."""
     flight = [0.0, 0.0, 2.0]

@@ -295,7 +295,7 @@ class Adaptive(Integrator):
         """
         q, v = state.q, state.velocity(self.time_step)
         if remaining > 0:
-            total = replace(total, contact=None, problem=None, viscous=None)
+            total = replace(total, contact=None, problem=None, load=None, viscous=None)
         if remaining > 0 and state.history:
             q, v = between(*state.history, q, v, self._length(self.last), 1 - remaining)
             prescribed = self.environment.anchors.prescribed(q, time)

@@ -260,7 +260,7 @@ class ImplicitEuler(Integrator):
         cost = replace(
             self.stepper.work_so_far() - work_before, steps=1, step_error=result.cost.step_error
         )
-        result = replace(result, cost=cost, tau=self.damped_tau)
+        result = replace(result, cost=cost, load=load, tau=self.damped_tau)
         return self._with_viscosity(result), faces.sides
 
     def _with_viscosity(self, result: StepResult) -> StepResult:

@@ -9,6 +9,7 @@ from petsc4py import PETSc
 
 from msmpetsc.backend.arrays import Positions, Rows
 from msmpetsc.comm import reduced
+from msmpetsc.constraints.forces import ExternalForces
 from msmpetsc.contact.step_contact import StepContactAt
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.solid import NeoHookean
@@ -61,6 +62,7 @@ class StepResult:
     contact      : contact at ``position``; None without contact, or if explicit
     problem      : F = M (x - y) + tau^2 (grad E - f_ext), without M in statics; None if explicit
     energy_tolerance : energy [J]; if g / tau^2 is this close to its minimum, x meets the error
+    load         : external forces of the problem; None if explicit or static
     tau          : tau of the problem [s]
     viscous      : gradient of the dissipation potential D (owned, 3) [N]; None without viscosity
     begun_error  : error of the history that a BDF2 step without history computes for itself
@@ -79,6 +81,7 @@ class StepResult:
     time_error: float = np.nan
     contact: StepContactAt | None = None
     problem: StepProblem | None = None
+    load: ExternalForces | None = None
     energy_tolerance: float = 0.0
     tau: float = np.inf
     viscous: Rows | None = None

@@ -220,10 +220,14 @@ class ResultFile:
         self.finished += 1
 
     def write_checkpoint(self, saved: Checkpoint) -> None:
-        """Store a checkpoint, with the rows and numbers laid out by `start_frames` (collective)."""
+        """Store a checkpoint, with the rows and numbers laid out by `start_frames` (collective).
+
+        Raises InputError if the file was deleted, moved or replaced since `start_frames`.
+        """
         slot = 0
         with self._together():
             if self._file is not None:
+                self._refuse_lost_name()
                 slot = int(np.argmin(self._file["checkpoint/step"]))
                 self._file["checkpoint/step"][slot] = -1
                 self._flush(self._file)
@@ -275,6 +279,19 @@ class ResultFile:
         file.flush()
         if self._storage is not None and self._storage.failure is not None:
             raise self._storage.failure
+
+    def _refuse_lost_name(self) -> None:
+        """Raise InputError if the path names no file or another file than is written."""
+        # before `start_frames` ends, the file has its temporary name
+        if self._storage is None or not self._numbers:
+            return
+        with suppress(FileNotFoundError):
+            if os.path.samestat(os.fstat(self._storage.fileno()), os.stat(self.path)):
+                return
+        raise InputError(
+            f"{self.path} was deleted, moved or replaced during the run: "
+            "--resume continues a moved file"
+        )
 
     def _lay_out(self, file: h5py.File, layout: Layout) -> None:
         """Create the datasets, or check the existing datasets of a file written in place.

@@ -243,6 +243,29 @@ def test_replaced_only_when_told_and_only_by_a_new_one(tmp_path):
     assert os.listdir(tmp_path) == ["x.h5"]
 
 
+@pytest.mark.parametrize("loss", ["deleted", "moved", "replaced"])
+def test_a_file_that_loses_its_name_ends_the_run(tmp_path, loss: str):
+    path, moved = tmp_path / "x.h5", tmp_path / "moved.h5"
+    with (
+        pytest.raises(InputError, match=r"x\.h5 was deleted, moved or replaced during the run"),
+        ResultFile(path, MPI.COMM_SELF, {}) as file,
+    ):
+        write_frames(file, range(3))
+        path.rename(moved)
+        if loss == "deleted":
+            moved.unlink()
+        if loss == "replaced":
+            path.write_text("of someone else")
+        file.write_checkpoint(saved(3))
+    assert not list(tmp_path.glob(".*")), "the lock is left"
+    if loss == "moved":
+        with open_result(moved) as kept:
+            assert_holds(kept, 3)
+            assert newest_checkpoint(kept)[0] == 2
+    if loss == "replaced":
+        assert path.read_text() == "of someone else"
+
+
 def test_refused_on_all_ranks_together(tmp_path):
     path = tmp_path / "x.h5"
     with ResultFile(path, MPI.COMM_SELF, {}) as file:

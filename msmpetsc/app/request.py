@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from msmpetsc.scene.reading import Scene
 
 File = str | os.PathLike[str]
+# largest whole number of an option [-]; a double holds every whole number up to it
+MOST = 2**53
 
 
 class Option(NamedTuple):
@@ -145,6 +147,8 @@ class RunRequest:
                 raise InputError(f"{flag_of(name)} must be a whole number, not {value!r}")
             if kind is int and value is not None and value < 1:
                 raise InputError(f"{flag_of(name)} must be at least 1, not {value}")
+            if kind is int and value is not None and value > MOST:
+                raise InputError(f"{flag_of(name)} must be at most {MOST}, not {value}")
             if choices and value not in (None, *choices):
                 raise InputError(f"{flag_of(name)} is {' or '.join(choices)}, not {value!r}")
         refuse_other_format("-o", self.output, RESULT_NAMES)

@@ -110,6 +110,10 @@ TOO_MUCH = {
         ["run", "scene.toml", "--checkpoint-every", "9" * 5000],
         "--checkpoint-every: invalid int value",
     ),
+    "true error": (
+        ["run", "scene.toml", "--true-error", "9" * 20],
+        "--true-error must be at most",
+    ),
 }
 
 

@@ -30,7 +30,7 @@ from msmpetsc.study.sizing.choice import (
     tables,
 )
 from msmpetsc.study.sizing.orders import ORDERS, ErrorLaw, cosine_of, error_law
-from msmpetsc.study.sizing.trials import Sizer
+from msmpetsc.study.sizing.trials import Sizer, fewest_cells
 from msmpetsc.study.table import Row
 
 STATIC = 'integrator = "static"'
@@ -61,6 +61,11 @@ def test_an_error_that_jumps_between_two_like_sizes_has_a_law():
     """Its order would be 618, and 0.2^618 underflows."""
     jump = ErrorLaw(1.0, 1.5).through((0.2, 0.5), (0.198, 0.001))
     assert jump.error(0.2) == pytest.approx(0.5) and jump.size(0.1) < 0.2
+
+
+@pytest.mark.parametrize("error", [0.0, 1e-300, 5e-324])
+def test_no_number_of_cells_is_enough_for_a_vanishing_error(error: float):
+    assert fewest_cells(ErrorLaw(0.03, 1.0), error) == math.inf
 
 
 @pytest.mark.parametrize(("order", "cosine"), [(1.0, 0.0), (1.5, 0.0), (1.5, 0.5), (2.0, 0.9)])

@@ -308,10 +308,16 @@ class Sizer:
 
 
 def fewest_cells(law: ErrorLaw, error: float) -> float:
-    """Return the fewest cells whose error is at most ``error``; infinity for an error of 0."""
+    """Return the fewest cells whose error is at most ``error``; infinity if no number is enough."""
     if error <= 0:
         return math.inf
-    return 1 if law.factor <= 0 else max(1, math.ceil(law.size(error) ** -3))
+    if law.factor <= 0:
+        return 1
+    # a size of 1e-103 and below has more cells than a double counts
+    try:
+        return max(1, math.ceil(law.size(error) ** -3))
+    except (OverflowError, ZeroDivisionError):
+        return math.inf
 
 
 def _distance(run: SizeTrial, reference: SizeTrial) -> float:

@@ -104,6 +104,8 @@ def _bounds_passed(name: str, value: str) -> Iterator[str]:
         yield f"a number of iterations or parts is from 1 to {MOST_ITERATIONS}, not {value}"
     if POSITIVE.fullmatch(name) and number <= 0:
         yield f"it must be above 0, not {value}"
+    if name.endswith("rtol") and number >= 1:
+        yield f"a relative tolerance must be below 1, not {value}"
 
 
 def refuse_unused(comm: MPI.Comm, at_end: bool = False, awaited: tuple[str, ...] = ()) -> None:

@@ -48,6 +48,7 @@ NO_USE = {
     "snes_max_it": ("1000000000", "from 1 to"),
     "ksp_rtol": ("0", "above 0"),
     "fallback_ksp_rtol": ("", "needs a number"),
+    "mg_coarse_ksp_rtol": ("inf", "below 1"),
     "snes_linesearch_damping": ("NaN", "not a number"),
     "mg_levels_ksp_chebyshev_eigenvalues": ("1,nan", "not a number"),
     "mg_levels_1_pc_python_type": ("abc", "Python"),

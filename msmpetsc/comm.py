@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from msmpetsc.backend.arrays import Array, Indices
-from msmpetsc.errors import MsmpetscError, as_expected
+from msmpetsc.errors import InputError, MsmpetscError, as_expected
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -39,6 +39,19 @@ def together(comm: MPI.Comm) -> Iterator[None]:
         if first is not None:
             first.on_all_ranks = True
             raise first
+
+
+def refuse_unlike_ranks(comm: MPI.Comm, asked: Mapping[str, object]) -> None:
+    """Raise InputError on all ranks if ranks ask for different things (collective).
+
+    asked : what this rank asks for, by name; compared as text
+    """
+    texts = comm.allgather({name: repr(value) for name, value in asked.items()})
+    unlike = [name for name in asked if len({text[name] for text in texts}) > 1]
+    if unlike:
+        error = InputError(f"{', '.join(unlike)}: all ranks must ask for the same")
+        error.on_all_ranks = True
+        raise error
 
 
 def on_root(comm: MPI.Comm, function: Callable[[], T]) -> T | None:

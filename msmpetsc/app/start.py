@@ -19,6 +19,7 @@ from msmpetsc.app.abort import ending_together, logged_on_root
 from msmpetsc.app.request import OPTIONS, RunRequest
 from msmpetsc.app.resume import earlier_run, kept_options
 from msmpetsc.build import Geometry, Model, build_model
+from msmpetsc.comm import refuse_unlike_ranks
 from msmpetsc.errors import STATUS_INTERRUPTED, InputError
 from msmpetsc.fields import Frame
 from msmpetsc.results.checkpoint_reader import Earlier, end_of_run
@@ -28,6 +29,8 @@ from msmpetsc.solve.petsc.words import words_of
 
 P = ParamSpec("P")
 T = TypeVar("T")
+# options of a run that may differ between ranks
+OF_A_RANK = ("scene", "quiet", "on_frame")
 # a scene file, tables, or a scene
 Source = str | PathLike[str] | Mapping[str, Any] | Scene
 
@@ -108,6 +111,9 @@ def options_given(
 
     Yields the request with all options, and the earlier run or None.
     """
+    # the scene of rank 0 is the run's
+    asked = {name: getattr(request, name) for name in OPTIONS if name not in OF_A_RANK}
+    refuse_unlike_ranks(comm, asked)
     earlier = earlier_run(comm, request.resume, request.scene is not None)
     if earlier is not None:
         words = [*kept_options(earlier, request.petsc_words), *request.petsc_words]
@@ -260,6 +266,8 @@ class Simulation:
 
     def _begin(self, scene: Scene, resources: ExitStack) -> Iterator[Frame]:
         """Build the model, reusing the geometry if it fits, and return the steps (collective)."""
+        asked = {"scene": list(scene.leaves()), "petsc_options": self._words, "device": self.device}
+        refuse_unlike_ranks(self.comm, asked)
         start_for_runs(self.comm, self._words)
         from msmpetsc.solve import presets, refused_options, simulate
         from msmpetsc.solve.petsc.device import AIJCUSPARSE, OPTION, choose

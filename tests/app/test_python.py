@@ -153,6 +153,16 @@ def test_a_failure_of_some_ranks_ends_all_with_its_line_and_status(tmp_path, ran
     assert not [path.name for path in tmp_path.glob("*x.h5.*")]
 
 
+def test_ranks_that_ask_for_different_runs_are_refused(scene: Path, tmp_path: Path):
+    """They waited for each other for ever."""
+    done = run(2, WORKERS / "unlike_worker.py", scene, tmp_path / "x.h5", status=0)
+    unlike = ["true_error", "picture", "petsc_options", "scene"]
+    said = [
+        f"{number} {name}: all ranks must ask for the same" for number, name in enumerate(unlike)
+    ]
+    assert sorted(done.stdout.splitlines()) == sorted(2 * [*said, "4 ran"])
+
+
 def test_ranks_lose_patience_seconds_apart(monkeypatch):
     """The first rank to lose patience ends all ranks before they also report the error."""
     clock = SimpleNamespace(now=0.0, monotonic=lambda: clock.now)

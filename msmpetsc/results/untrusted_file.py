@@ -154,10 +154,9 @@ def checked_dataset(path: Path, file: h5py.File, name: str) -> h5py.Dataset:
     # checked before the shape, which HDF5 may look up in the other file
     if dataset.is_virtual or dataset.external:
         raise InputError(f"{path}: {name} is kept in another file, which is not opened")
-    field = FIELDS.get(name)
-    kinds = "f" if field is None or field.dtype.startswith("f") else "iu"
-    axes = len(field.shape) if field else dataset.ndim
-    if dataset.dtype.kind not in kinds or not dataset.shape or dataset.ndim != axes:
+    field = FIELDS[name]
+    kinds = "f" if field.dtype.startswith("f") else "iu"
+    if dataset.dtype.kind not in kinds or dataset.ndim != len(field.shape):
         kind = printable(str(dataset.dtype), 40)
         raise InputError(f"{path} is damaged: {name} has type {kind} and shape {dataset.shape}")
     rows = " x ".join(map(str, dataset.shape))

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 
 import matplotlib
@@ -18,7 +17,6 @@ from msmpetsc.view.mesh import KINDS
 CAPTION, LINES = 68, ((21, 22), (16, 50))
 
 
-@cache
 def typeface(size: int) -> ImageFont.FreeTypeFont:
     """Return the font DejaVu Sans, which comes with matplotlib, in a size [px]."""
     return ImageFont.truetype(

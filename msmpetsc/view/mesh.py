@@ -19,8 +19,6 @@ from msmpetsc.view.camera import Camera
 from msmpetsc.view.colours import BOUNDARY_CELL, INTERIOR_CELL
 from msmpetsc.view.drawable import BodiesAtRest, Drawable
 
-# angle between normals above which an edge is sharp [degrees]
-SHARP = 30.0
 # approximate limit of triangles after refinement
 MAX_TRIANGLES = 30_000
 # corners of a cell in VTK's order
@@ -130,14 +128,14 @@ def _split(subject: Drawable) -> Drawable:
 def split_at_edges(points: Positions, triangles: Indices) -> tuple[Indices, Indices]:
     """Return the original point (d,) of each drawn point, and triangles (f, 3) of drawn points.
 
-    The first v drawn points are the originals. Sharp edges separate smooth patches around a point;
-    it has a duplicate for each patch after the first.
+    The first v drawn points are the originals. Edges of more than VTK's 30 degrees separate smooth
+    patches around a point; it has a duplicate for each patch after the first.
     """
     surface = surface_of(points, triangles)
     options: dict[str, Any] = dict(
         consistent_normals=False, non_manifold_traversal=False, cell_normals=False
     )
-    split = surface.compute_normals(split_vertices=True, feature_angle=SHARP, **options)
+    split = surface.compute_normals(split_vertices=True, **options)
     return split["pyvistaOriginalPointIds"], split.regular_faces
 
 

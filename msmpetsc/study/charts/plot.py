@@ -18,7 +18,7 @@ from pandas import DataFrame
 
 from msmpetsc.results.disk import write_whole
 from msmpetsc.study import formatting
-from msmpetsc.study.table import records, spread
+from msmpetsc.study.table import records
 
 INK, FAINT = "#2b2f36", "#8a8f98"
 # Okabe and Ito's colours without yellow, faint on white; then Paul Tol's and a brown
@@ -128,9 +128,9 @@ class Axes:
         self.draw(values, mark)
 
     def whiskers(self, rows: DataFrame, columns: Columns) -> None:
-        """Draw the range of each row over its repeats; the second column is its cost."""
-        ends = spread(rows, columns[1]).assign(x=rows[columns[0]], curve=rows["label"]).dropna()
-        values = records(ends.rename(columns={"least": "y", "greatest": "high"}))
+        """Draw the range of each row over its repeats, by its columns from ``spread``."""
+        ends = rows[[columns[0], "least", "greatest", "label"]].dropna()
+        values = records(ends.set_axis(["x", "y", "high", "curve"], axis=1))
         part = {"opacity": 1, "aria": False}
         bar = {"type": "errorbar", "ticks": part | {"size": 7}, "rule": part}
         self.draw(values, bar, y2={"field": "high"}, color=nominal(self.styles, "color"))

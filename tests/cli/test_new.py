@@ -152,16 +152,6 @@ def test_commands_that_are_shown_can_be_pasted(tmp_path: Path, capsys):
     assert status_of("new", scene, "--mesh", mesh) == 0
     command = capsys.readouterr().out.splitlines()[-1].removeprefix("to run it: ")
     assert shlex.split(command) == ["msmpetsc", "run", str(scene), "--picture"]
-    study = tmp_path / "my study.toml"
-    study.write_text('[[scene]]\nname = "a"\nfile = "a.toml"\n[[sweep]]\npreset = ["newton"]\n')
-    remedies = {
-        ("run", mesh, "is a mesh, no scene: "): ["new", mesh.with_suffix(".toml"), "--mesh", mesh],
-        ("run", study, "is a study, no scene: "): ["study", study],
-        ("study", scene, "is a scene, no study: "): ["run", scene],
-    }
-    for (wrong, path, words), remedy in remedies.items():
-        told = command_error(wrong, path).partition(words)[2]
-        assert shlex.split(told) == ["msmpetsc", *map(str, remedy)]
     told = (
         command_error("check", scene).partition("of ")[2].partition(": ")[2].partition(" stores")[0]
     )

@@ -65,12 +65,14 @@ def test_a_mistaken_command_is_told_all_commands(words: list[str], expected: str
 def test_a_mesh_for_a_scene_and_a_scene_for_a_study_name_the_command_that_takes_them(
     tmp_path: Path,
 ):
-    scene, mesh, study = block_scene(tmp_path), tmp_path / "scene.ply", tmp_path / "study.toml"
+    """The commands quote names with blanks."""
+    scene = block_scene(tmp_path, name="my scene")
+    mesh, study = scene.with_suffix(".ply"), tmp_path / "my study.toml"
     study.write_text('[[scene]]\nname = "a"\nfile = "a.toml"\n[[sweep]]\npreset = ["newton"]\n')
     remedies = {
-        ("run", mesh): f"is a mesh, no scene: msmpetsc new {scene} --mesh {mesh}",
-        ("run", study): f"is a study, no scene: msmpetsc study {study}",
-        ("study", scene): f"is a scene, no study: msmpetsc run {scene}",
+        ("run", mesh): f"is a mesh, no scene: msmpetsc new '{scene}' --mesh '{mesh}'",
+        ("run", study): f"is a study, no scene: msmpetsc study '{study}'",
+        ("study", scene): f"is a scene, no study: msmpetsc run '{scene}'",
     }
     for (command, path), remedy in remedies.items():
         assert f"{path}: {remedy}" in command_error(command, path)

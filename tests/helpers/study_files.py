@@ -7,16 +7,15 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from conftest import ENVIRONMENT, ROOT
+from conftest import ENVIRONMENT
+from study_stand_in import stands_in
 
 from msmpetsc.comm import log
 from msmpetsc.study import runner
-from msmpetsc.study.cases import Case, command, study_cases
+from msmpetsc.study.cases import Case, study_cases
 from msmpetsc.study.runner import run_study
 from msmpetsc.study.study_file import load_study
 from msmpetsc.study.table import COLUMNS, read_table, records
-
-STAND_IN = ROOT / "tests" / "helpers" / "study_stand_in.py"
 
 SCENE = """
 mesh = { source = "box.ply" }
@@ -31,12 +30,6 @@ ONE_SCENE = '[[scene]]\nname = "a"\nfile = "scene.toml"\n'
 @pytest.fixture
 def stand_in(monkeypatch):
     """Make cases run the stand-in instead of the program."""
-
-    def stands_in(case: Case, result: Path, figures: Path) -> list[str]:
-        words = command(case, result, figures)
-        at = words.index("-m")
-        return [*words[:at], str(STAND_IN), *words[at + 2 :]]
-
     monkeypatch.setattr(runner, "command", stands_in)
     for name, value in ENVIRONMENT.items():
         monkeypatch.setenv(name, value)

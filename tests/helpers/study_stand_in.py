@@ -15,6 +15,7 @@ import sys
 import tomllib
 from pathlib import Path
 from time import sleep
+from typing import Any
 
 CALLS = "calls.txt"
 
@@ -30,6 +31,15 @@ def begin(words: list[str]) -> None:
         (folder / "child").write_text(str(child.pid))
     if "-ksp_hang" in words:
         sleep(60)
+
+
+def stands_in(*case: Any) -> list[str]:
+    """Return the command of a case with the stand-in in place of the program."""
+    from msmpetsc.study.cases import command
+
+    words = command(*case)
+    at = words.index("-m")
+    return [*words[:at], __file__, *words[at + 2 :]]
 
 
 if __name__ == "__main__":

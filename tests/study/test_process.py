@@ -6,15 +6,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from block_scene import block_scene
 from conftest import AS_ROOT, ENVIRONMENT, run
-from study_files import alive
 
 from msmpetsc.cli.commands import doctor
-from msmpetsc.study import process
-from msmpetsc.study.process import PROGRAM, Processes, environment
-
-TIME = {"step": 0.01, "duration": 0.1}
+from msmpetsc.study.process import Processes, environment
 
 
 @pytest.fixture
@@ -36,17 +31,6 @@ def test_a_process_alone_takes_no_folder_from_others(
     code = "import os; from mpi4py import MPI; print(*os.listdir(os.environ['TMPDIR']))"
     assert processes.run([sys.executable, "-c", code], tmp_path / "log", 30).status == 0
     assert (tmp_path / "log").read_text().split() == os.listdir(tmp_path / "shared")
-
-
-@pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks at Linux's processes")
-def test_it_is_ended_when_it_takes_too_long(tmp_path: Path, processes: Processes, monkeypatch):
-    began, end = [], process.end
-    monkeypatch.setattr(process, "end", lambda one: (began.append(one.pid), end(one)))
-    path = block_scene(tmp_path, time={"step": 0.01, "duration": 1000.0})
-    command = [*PROGRAM, "run", str(path), "-o", str(tmp_path / "x.h5")]
-    ended = processes.run(command, tmp_path / "log", 3)
-    assert ended.status is None and "longer than 3 s" in ended.reason
-    assert began and not any(map(alive, began))
 
 
 RUNS_WITHIN_A_RUN = """

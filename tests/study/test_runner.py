@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from conftest import ENVIRONMENT
 from one_process import command_error
-from study_files import ONE_SCENE, STAND_IN, alive, calls, carry_out, own_log, stand_in, study_file  # noqa: F401 (fixtures)
+from study_files import ONE_SCENE, alive, calls, carry_out, own_log, stand_in, study_file  # noqa: F401 (fixtures)
 
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
@@ -114,14 +114,10 @@ def test_a_case_that_takes_too_long_is_ended_with_all_it_started(tmp_path: Path,
 STUDY_IN_ITS_OWN_PROCESS = """
 import sys
 from pathlib import Path
+from study_stand_in import stands_in
 from msmpetsc.study import runner
-real = runner.command
-def stands_in(of, result, figures):
-    words = real(of, result, figures)
-    at = words.index("-m")
-    return [*words[:at], sys.argv[1], *words[at + 2:]]
 runner.command = stands_in
-runner.run_study(Path(sys.argv[2]), Path(sys.argv[3]))
+runner.run_study(Path(sys.argv[1]), Path(sys.argv[2]))
 """
 
 
@@ -129,7 +125,7 @@ runner.run_study(Path(sys.argv[2]), Path(sys.argv[3]))
 def test_a_study_that_is_stopped_leaves_its_table_and_no_process(tmp_path: Path):
     sweep = '[[sweep]]\npresets = ["newton"]\n'
     sweep += 'options = ["", "-ksp_children -ksp_hang", "-ksp_never"]'
-    paths = (STAND_IN, study_file(tmp_path, ONE_SCENE + sweep), tmp_path / "out")
+    paths = (study_file(tmp_path, ONE_SCENE + sweep), tmp_path / "out")
     words = [sys.executable, "-c", STUDY_IN_ITS_OWN_PROCESS, *map(str, paths)]
     heard = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)  # noqa: E731 (what runs in the background ignores it)
     study = subprocess.Popen(words, env=ENVIRONMENT, stderr=subprocess.DEVNULL, preexec_fn=heard)

@@ -54,12 +54,8 @@ def test_runs_without_common_times_or_nodes_have_no_trajectory_error(tmp_path: P
     reference = result(tmp_path / "r.h5", [0, 0.1], [rest, rest + 1], [1])
     with pytest.raises(InputError, match="nothing moves in it at the times of"):
         trajectory_error(result(tmp_path / "a.h5", [0, 0.03], [rest, rest], [1]), reference)
-    for positions in ([np.zeros((2, 3))] * 2, [rest + 1, rest]):
-        other = result(
-            tmp_path / f"{len(positions[0])}.h5", [0, 0.1], positions, [1] * len(positions[0])
-        )
-        with pytest.raises(InputError, match="different lattices"):
-            trajectory_error(other, reference)
+    with pytest.raises(InputError, match="different lattices"):
+        trajectory_error(result(tmp_path / "b.h5", [0, 0.1], [rest + 1, rest], [1]), reference)
     with pytest.raises(InputError, match="nothing moves"):
         trajectory_error(reference, result(tmp_path / "c.h5", [0, 0.1], [rest, rest], [1]))
 

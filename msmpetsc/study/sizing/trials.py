@@ -182,8 +182,8 @@ class Sizer:
         edges = [run.edge for run in runs]
         least, greatest = ORDERS
         if runs[-1].inverted > 0:
-            law = error_law(edges, distances, (least, least), cosine)
-            return replace(law, observed=False)
+            # two runs show no order, so the least is assumed
+            return error_law(edges[-2:], distances[-1:], ORDERS, cosine)
         is_out_of_phase = len(runs) > 2 and distances[0] > OUT_OF_PHASE
         orders = (USUAL_ORDER if is_out_of_phase else least, greatest)
         return error_law(edges, distances, orders, cosine, USUAL_ORDER)

@@ -183,8 +183,11 @@ class Resumed:
             words = "a file that a pin names has changed"
             refuse_changed_lattice(comm, self.earlier.path, pinned, words)
 
-    def restore(self, comm: MPI.Comm, file: ResultFile, simulation: "TimeLoop") -> None:
-        """Restore the simulation from the last checkpoint, if any (collective)."""
+    def restore(self, comm: MPI.Comm, simulation: "TimeLoop") -> int | None:
+        """Restore the simulation from the last checkpoint, if any (collective).
+
+        Returns the number of frames that the run keeps, None for all.
+        """
         path = self.earlier.path
         saved = read_checkpoint(comm, path, simulation.model.lattice.owned)
         kept = 0
@@ -198,14 +201,11 @@ class Resumed:
             if kept > self.earlier.finished:
                 raise InputError(f"{path} is damaged: it lacks frames from before its checkpoint")
             on_root(comm, lambda: refuse_unlike_frame(path, kept - 1))
+            simulation.restore(saved)
+            time = saved.step * simulation.time_step
+            log.info("goes on after step %d of %d (t = %.6g s)", saved.step, simulation.steps, time)
         # frames after the checkpoint belong to the scene before its change
-        if self.differs:
-            file.keep(kept)
-        if saved is None:
-            return
-        simulation.restore(saved)
-        time = saved.step * simulation.time_step
-        log.info("goes on after step %d of %d (t = %.6g s)", saved.step, simulation.steps, time)
+        return kept if self.differs else None
 
 
 def _with_an_effect(options: dict[str, str]) -> dict[str, Any]:

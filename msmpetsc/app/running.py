@@ -262,9 +262,9 @@ def start_output(
     Returns the number of frames up to the restored step.
     """
     write_model(comm, file, model)
-    if plan.resumed:
-        plan.resumed.restore(comm, file, simulation)
-    file.start_frames(simulation.stored, model.lattice.owned, simulation.rows, simulation.saved)
+    kept = plan.resumed.restore(comm, simulation) if plan.resumed else None
+    rows, saved = simulation.rows, simulation.saved
+    file.start_frames(simulation.stored, model.lattice.owned, rows, saved, kept)
     return simulation.stored_until(simulation.step) if simulation.step else 0
 
 

@@ -108,8 +108,6 @@ class ResultFile:
         self._descriptor: int | None = None
         # lock, temporary name and storage on rank 0, to be released
         self._resources = ExitStack()
-        # largest number of frames to copy, all if None
-        self._most_copied: int | None = None
         # number of rows of each rank, by the name of a distributed field
         self._rows: dict[str, list[int]] = {}
         # inodes of the lock and the temporary file, by path
@@ -160,16 +158,13 @@ class ResultFile:
         if self._begin is not Begin.IN_PLACE:
             self._collect(rows, dtype, counts, name)
 
-    def keep(self, frames: int) -> None:
-        """Limit the number of frames that are copied from the earlier file."""
-        self._most_copied = frames
-
     def start_frames(
         self,
         count: int,
         nodes: int,
         optional: Mapping[str, int] | None = None,
         saved: Checkpoint | None = None,
+        kept: int | None = None,
     ) -> None:
         """Lay out frames and checkpoints, and give the file its name (collective).
 
@@ -177,6 +172,7 @@ class ResultFile:
         nodes    : number of this rank's nodes
         optional : number of this rank's rows in the optional fields, by name: {"surface": 1000}
         saved    : checkpoint with the rows and numbers to lay out; None for q and q_previous only
+        kept     : largest number of frames to copy from the earlier file; None for all
         """
         rows_of_ranks = self._comm.allgather({"position": nodes, **(optional or {})})
         counts = {name: [rank[name] for rank in rows_of_ranks] for name in rows_of_ranks[0]}
@@ -191,7 +187,7 @@ class ResultFile:
         layout = Layout(count, sizes.pop("position"), sizes, rows, numbers)
         with self._together():
             if self._file is not None:
-                self._lay_out(self._file, layout)
+                self._lay_out(self._file, layout, kept)
         self.finished = self._comm.bcast(self.finished)
         if self._begin is Begin.COPY and saved is not None:
             self.write_checkpoint(saved)
@@ -293,7 +289,7 @@ class ResultFile:
             "--resume continues a moved file"
         )
 
-    def _lay_out(self, file: h5py.File, layout: Layout) -> None:
+    def _lay_out(self, file: h5py.File, layout: Layout, kept: int | None) -> None:
         """Create the datasets, or check the existing datasets of a file written in place.
 
         Raises InputError if the disk is too small, or an existing dataset does not fit.
@@ -309,10 +305,10 @@ class ResultFile:
         refuse_small_disk(self.path, layout.nbytes)
         layout.create(file)
         if self._begin is Begin.COPY:
-            self._copy_frames(file)
+            self._copy_frames(file, kept)
 
-    def _copy_frames(self, file: h5py.File) -> None:
-        """Copy the finished frames of the earlier file, up to the limit of `keep`."""
+    def _copy_frames(self, file: h5py.File, kept: int | None) -> None:
+        """Copy the finished frames of the earlier file, at most ``kept`` unless it is None."""
         with Result(self.path) as earlier:
             known = [name for name in earlier.frames if name in file["frames"]]
             datasets = {name: file["frames"][name] for name in known}
@@ -320,9 +316,7 @@ class ResultFile:
                 shape = earlier.frames[name].shape
                 if dataset.shape[1:] != shape[1:]:
                     raise InputError(f"{self.path} is damaged: frames/{name} has shape {shape}")
-            count = len(earlier.frames.time)
-            if self._most_copied is not None:
-                count = min(self._most_copied, count)
+            count = len(earlier.frames.time[:kept])
             for index in range(count):
                 for name, dataset in datasets.items():
                     dataset[index] = earlier.frames[name][index]

@@ -40,6 +40,27 @@ def test_a_ball_gains_nothing(tmp_path: Path, integrator: str, restitution: floa
     assert frames[-1].momentum[2] > 0
 
 
+@pytest.mark.parametrize(("cell", "speed"), [(0.2, 4.0), (0.25, 2.0)])
+def test_light_nodes_leap_off_no_faster_than_they_came_by_verlet(
+    tmp_path: Path, cell: float, speed: float
+):
+    """Near the stability limit the penalty pushes a node out faster than it came.
+
+    The ball has cells that are nearly empty.
+    """
+    path = ball(
+        tmp_path,
+        cages={"cell_size": cell},
+        material=solid_of(3e5, 0.3),
+        time={"step": 0.0025, "duration": 0.1, "integrator": "verlet"},
+        obstacle=[PLANE | {"restitution": 0.0}],
+        gravity=GRAVITY,
+        start={"velocity": [0, 0, -speed]},
+    )
+    _, frames = play(path)
+    assert rise(frames) < 1e-3
+
+
 # response -> obstacle 0.05 m below a plate
 GROUNDS = {
     "penalty": plane_at(-0.05),

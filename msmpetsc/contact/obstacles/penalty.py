@@ -102,7 +102,9 @@ class Penalty:
     ) -> tuple[Positions, Positions]:
         """Return q_n and a q_(n-1) (n, 3) [m] that scales the normal velocity of striking nodes.
 
-        A node strikes in the step in which it reaches a face.
+        A node strikes in the step in which it reaches a face. In explicit steps its depth is scaled
+        as well. Otherwise the penalty would reverse the velocity that belongs to the depth, which
+        near the stability limit may be 2.6 times the velocity of the impact.
         """
         if self.restitution is None:
             return q, q_previous
@@ -110,8 +112,16 @@ class Penalty:
         start = step.time - step.length
         strikes = self.obstacle.depths(q_previous, start, step.sides)[0][rows] < 0
         if strikes.any():
+            rows, lost = rows[strikes], 1 - self.restitution
             q_previous = q_previous.copy()
-            q_previous[rows[strikes]] += (1 - self.restitution) * into[strikes]
+            q_previous[rows] += lost * into[strikes]
+            if step.explicit:
+                depth, face = self.obstacle.depths(q, step.time, step.sides)
+                normal = self.obstacle.normals_at(q[rows], step.time, face[rows])
+                back = lost * depth[rows, None] * normal
+                q = q.copy()
+                q[rows] += back
+                q_previous[rows] += back
         return q, q_previous
 
 

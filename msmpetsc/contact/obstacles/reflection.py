@@ -3,7 +3,8 @@
 The state has q_n and q_(n-1) in place of a velocity. There are two laws:
 
 - ``Penalty.struck`` scales the normal velocity of a striking node by e through a new q_(n-1). The
-  node's position stays, so no energy is added. The penalty force then reverses the velocity.
+  node's position stays, so no energy is added. The penalty force then reverses the velocity. In
+  explicit steps the depth is scaled by e, too.
 - ``Exchange`` is the paper's reflection (section 5): v_(n+1) = -v_n by q_(n+1) = q_(n-1). It moves
   nodes against their springs and thereby adds energy, so it is not conservative.
 """
@@ -20,13 +21,15 @@ from msmpetsc.contact.obstacles.moving_solid import Obstacle
 class StepTaken:
     """A completed step: the time [s] of its end, its length [s], and the sides of nodes.
 
-    sides : (n,) faces by which nodes are in contact (Obstacle.sides), or (o, n) for several
-            obstacles; None without contact
+    sides    : (n,) faces by which nodes are in contact (Obstacle.sides), or (o, n) for several
+               obstacles; None without contact
+    explicit : whether the step has not resolved the penalty: a node may end deep in an obstacle
     """
 
     time: float
     length: float
     sides: Indices | None = None
+    explicit: bool = False
 
 
 @dataclass(frozen=True)

@@ -260,7 +260,7 @@ class Verlet(Integrator):
         self.sides = self.environment.obstacles.contact_faces(
             start, self.q, end, end - begin, self.sides, self.fixed.all(axis=1)
         )
-        step = StepTaken(end, end - begin, self.sides)
+        step = StepTaken(end, end - begin, self.sides, explicit=True)
         after, before, work = self.environment.obstacles.strike(self.q, start, step, self.fixed)
         self.work += work
         if before is not start:

@@ -84,10 +84,6 @@ class Cages:
         fills = self.table.rows_of(keys, self.fills)[:, *CORNERS.T]
         return fills, self.table.rows_of(keys, self.moments)
 
-    def corner_keys(self, keys: Indices) -> Indices:
-        """Return the keys (..., 8) of the corner nodes of cells (...,)."""
-        return self.copies.corner_keys(keys, decode_morton(keys))
-
 
 @dataclass(frozen=True)
 class SlabCells:
@@ -191,8 +187,8 @@ def _with_copies(
         ]
         for body, parts in enumerate(of_parts):
             if parts:
-                several = parts.several
-                ijk = parts.ijk[several] + grids.first(body)
+                several = np.flatnonzero(parts.count > 1)
+                ijk = unpacked(parts.keys[several]) + grids.first(body)
                 number = ranges(np.zeros_like(several), parts.count[several])
                 of_cell = np.repeat(encode_morton(ijk), parts.count[several])
                 rows.append((of_cell, number, parts.shares, parts.spread))

@@ -81,20 +81,6 @@ class CellParts:
     spread: Rows
     points: PartsOfPoints
 
-    @property
-    def ijk(self) -> Indices:
-        """Grid index (b, 3) of the cut cells."""
-        return unpacked(self.keys)
-
-    @property
-    def several(self) -> Indices:
-        """Numbers of the cells with several parts."""
-        return np.flatnonzero(self.count > 1)
-
-    def find(self, ijk: Indices) -> Indices:
-        """Return the number (...,) of each cut cell (..., 3), -1 for another cell."""
-        return places_of(self.keys, packed(ijk))
-
 
 def parts_of(surface: Surface, grid: Grid, axes: Indices, volume: float) -> CellParts:
     """Return the parts of the body in the cells that a closed surface cuts.
@@ -117,12 +103,11 @@ def parts_of(surface: Surface, grid: Grid, axes: Indices, volume: float) -> Cell
     part = part_of_piece[first_piece[cell] + piece]
     count = np.ones(len(keys), np.int64)
     count[several] = split.parts
-    several = np.flatnonzero(count > 1)
-    at_faces = np.full((len(keys), 6), -1)
-    at_faces[several] = np.arange(split.faces.shape[0] * 6).reshape(-1, 6)
-    sides = Sides(at_faces, split.faces.reshape(-1, LINES**2))
+    masks = np.ones((len(keys), 6), np.uint8)
+    bits = np.where(split.faces >= 0, 1 << np.maximum(split.faces, 0), 0)
+    masks[count > 1] = np.bitwise_or.reduce(bits, axis=2)
     crossing = _crossing_rows(codes, keys, size, flush, ends)
-    links, separated = _links(surface, grid, keys, cell, part, crossing, sides)
+    links, separated = _links(surface, grid, keys, cell, part, crossing, count, masks, split.faces)
     kept = np.flatnonzero((count > 1) | separated)
     own = rows_of(cell, kept)
     # a triangle in the low face of a cell of a single part bounds the body below
@@ -130,7 +115,6 @@ def parts_of(surface: Surface, grid: Grid, axes: Indices, volume: float) -> Cell
     points = PartsOfPoints(
         surface, keys[kept], np.searchsorted(kept, cell[own]), triangle[own], part[own]
     )
-    masks = sides.masks()
     return CellParts(keys, count, links, masks, separated, split.shares, split.spread, points)
 
 
@@ -246,23 +230,6 @@ def _crossing_rows(
     return crossing
 
 
-class Sides(NamedTuple):
-    """Parts at the faces of the cells with several parts.
-
-    row   : (b, 6) row of each face of each cut cell, the low faces first; -1 for a single part
-    parts : (r, LINES^2) part at each line of a face, -1 outside the body
-    """
-
-    row: Indices
-    parts: Array
-
-    def masks(self) -> Array:
-        """Return the parts at each face (b, 6) of each cell as bit masks."""
-        bits = np.where(self.parts >= 0, 1 << np.maximum(self.parts, 0), 0)
-        of_rows = np.append(np.bitwise_or.reduce(bits, axis=1), 1)
-        return of_rows[self.row].astype(np.uint8)
-
-
 def _links(
     surface: Surface,
     grid: Grid,
@@ -270,20 +237,26 @@ def _links(
     cell: Indices,
     part: Indices,
     crossing: list[Indices],
-    sides: Sides,
+    count: Indices,
+    masks: Array,
+    faces: Array,
 ) -> tuple[Links, Mask]:
     """Return the parts of neighbouring cut cells that meet, and the mask (b,) of ``separated``.
 
     cell     : (r,) cell of each row
     part     : (r,) part of each row, -1 if its piece bounds no part of the cell
     crossing : for each axis, the rows of ``_crossing_rows``
+    count    : (b,) number of parts in each cell
+    masks    : (b, 6) parts at the faces of each cell, as in CellParts
+    faces    : (m, 6, LINES^2) part at each line of each face of the m cells with several parts
     """
-    ijk, masks, steps = unpacked(keys), sides.masks(), np.eye(3, dtype=np.int64)
+    ijk, steps = unpacked(keys), np.eye(3, dtype=np.int64)
     beyond = np.stack([places_of(keys, packed(ijk + step)) for step in steps])
     # rows of pieces that bound parts
     bounding = [rows[:, (part[rows] >= 0).all(axis=0)] for rows in crossing]
     # the middle of an uncrossed face tells whether two cells of a single part meet
-    is_single = sides.row[:, 0] < 0
+    is_single = count == 1
+    row = np.cumsum(~is_single) - 1
     asked = (beyond >= 0) & is_single & is_single[beyond]
     for axis, (below, _) in enumerate(bounding):
         asked[axis, cell[below]] = False
@@ -297,15 +270,15 @@ def _links(
         low = np.flatnonzero(beyond[axis] >= 0)
         high = beyond[axis, low]
         # in cells with several parts, lines tell which parts meet in the face
-        rows = sides.row[low, 3 + axis], sides.row[high, axis]
-        both = (rows[0] >= 0) & (rows[1] >= 0)
+        both = ~is_single[low] & ~is_single[high]
         neither = is_single[low] & is_single[high]
         for p in range(COPIES):
             for q in range(COPIES):
                 meet = (masks[low, 3 + axis] >> p & 1) & (masks[high, axis] >> q & 1) > 0
                 meet[neither] &= asked[axis, low[neither]]
-                lines = [sides.parts[row[meet & both]] for row in rows]
-                meet[meet & both] = ((lines[0] == p) & (lines[1] == q)).any(axis=1)
+                on_low = faces[row[low[meet & both]], 3 + axis] == p
+                on_high = faces[row[high[meet & both]], axis] == q
+                meet[meet & both] = (on_low & on_high).any(axis=1)
                 own = low[meet]
                 meeting.append(np.stack([own, np.full_like(own, p), np.full_like(own, q)]))
         own, p, q = np.unique(np.concatenate(meeting, axis=1), axis=1)

@@ -49,9 +49,9 @@ class Copies:
         """Return the row (...,) of each cell, -1 for an ordinary cell."""
         return places_of(self.keys, keys)
 
-    def corner_keys(self, keys: Indices, ijk: Indices) -> Indices:
-        """Return the keys (..., 8) of the corner nodes of cells (...,) at ``ijk`` (..., 3)."""
-        corners = encode_morton(ijk[..., None, :] + CORNERS)
+    def corner_keys(self, keys: Indices) -> Indices:
+        """Return the keys (..., 8) of the corner nodes of cells (...,)."""
+        corners = encode_morton(decode_morton(keys)[..., None, :] + CORNERS)
         row = self.place(keys)
         own = row >= 0
         corners[own] = self.corners[row[own]]
@@ -66,7 +66,7 @@ class Copies:
         """
         places = decode_morton(keys)[:, None] + OCTANTS
         cells = encode_morton(np.maximum(places, 0))[..., None] + np.arange(COPIES)
-        corners = self.corner_keys(cells, decode_morton(cells))
+        corners = self.corner_keys(cells)
         corner = np.take_along_axis(corners, np.arange(8)[None, :, None, None], axis=3)[..., 0]
         is_valid = (table.find(cells) >= 0) & (places >= 0).all(axis=2)[..., None]
         has = is_valid & (corner == keys[:, None, None])
@@ -156,7 +156,7 @@ def _node_copies(parts: CellParts, cells: Indices, is_valid: Mask, around: Indic
     is_valid : (c,) bool
     around   : (n, 8) numbers of the cells around each node
     """
-    number = parts.find(cells)
+    number = places_of(parts.keys, packed(cells))
     count = np.where(number >= 0, parts.count[number], 1) * is_valid
     exists = np.arange(COPIES) < count[around][..., None]
     meets = np.zeros((len(parts.keys), 3), np.int64)

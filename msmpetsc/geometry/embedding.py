@@ -105,7 +105,7 @@ def _around(cages: Cages, keys: Indices) -> tuple[Mask, Indices]:
     ordinary = cages.copies.keys - cages.copies.keys % COPIES
     rows = np.flatnonzero(np.isin(cells, ordinary).any(axis=1))
     copies = cells[rows, :, None] + np.arange(COPIES)
-    own, corners = cages.corner_keys(keys[rows]), cages.corner_keys(copies)
+    own, corners = cages.copies.corner_keys(keys[rows]), cages.copies.corner_keys(copies)
     joined = (corners[..., None] == own[:, None, None, None, :]).any(axis=(3, 4))
     joined &= cages.table.find(copies) >= 0
     joined[:, MIDDLE] = copies[:, MIDDLE] == keys[rows, None]

@@ -171,7 +171,7 @@ class Finder:
         """
         keys = lattice.table.with_ghosts(lattice.ghosts, lattice.table.keys)
         if table.table.region.group is None:
-            return np.isin(keys, self.cages.corner_keys(self._painted_cells(table)))
+            return np.isin(keys, self.cages.copies.corner_keys(self._painted_cells(table)))
         where = np.zeros(len(keys), bool)
         points = np.where(nearest.of_part[:, None], nearest.points, lattice.nodes)
         for number, group, marked in self._groups(table, are_nodes=True):

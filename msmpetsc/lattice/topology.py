@@ -73,12 +73,12 @@ class Topology(NamedTuple):
 
 def topology_of(cages: Cages) -> Topology:
     """Return the nodes and cells of this rank's part of the lattice (collective)."""
-    corner_keys = cages.corner_keys(cages.table.keys)
+    corner_keys = cages.copies.corner_keys(cages.table.keys)
     table = SortedKeys(cages.table.comm, corner_keys.ravel())
     corners = table.find(corner_keys)
     owned = len(table.keys)
     keys, octants = _cells_around(cages, table)
-    corner_keys = cages.corner_keys(keys)
+    corner_keys = cages.copies.corner_keys(keys)
     node_keys = np.concatenate([table.keys, np.setdiff1d(corner_keys, table.keys)])
     order = np.argsort(node_keys)
     cells = order[np.searchsorted(node_keys, corner_keys, sorter=order)].astype(np.int32)

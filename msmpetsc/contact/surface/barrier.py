@@ -15,7 +15,8 @@ ipctk runs on a single thread, so that sums are reproducible. Its arrays are in 
 """
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from itertools import compress
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 from mpi4py import MPI
@@ -116,8 +117,6 @@ class Barrier:
         self.distances, self.potentials = [law.distance], [self._potential(law.distance)]
         # Pairs of creases for each distance; dhat, the first, has none
         self.creases: CandidateSets = (CandidateSet(ipctk.Candidates()),)
-        # Pairs of creases by kind, with their points (k, 4)
-        self._creased: list[list[tuple[list[Any], Indices]]] = []
 
     def _potential(self, distance: float) -> "ipctk.BarrierPotential":
         """Return the barrier of a distance [m], with the law's stiffness per area."""
@@ -140,16 +139,6 @@ class Barrier:
             )
         sets, dropped = creases(pairs, self.mesh, points, self.law.distance)
         self.creases += tuple(map(CandidateSet, sets.values()))
-        for crease in sets.values():
-            kinds, parts = (
-                (crease.fv_candidates, crease.ee_candidates),
-                (self.mesh.edges, self.mesh.faces),
-            )
-            of = [
-                np.array([pair.vertex_ids(*parts) for pair in kind], int).reshape(-1, 4)
-                for kind in kinds
-            ]
-            self._creased.append(list(zip(kinds, of, strict=True)))
         self.distances += sets
         self.potentials += [self._potential(distance) for distance in sets]
         return dropped
@@ -212,7 +201,8 @@ class Barrier:
         """
         ipctk, corners, near = self.ipctk, (self.mesh.edges, self.mesh.faces), touched.copy()
         near[corners[0][touched[corners[0]].any(axis=1)]] = True
-        edges, faces = (np.flatnonzero(near[of].any(axis=1)) for of in corners)
+        near_edges, near_faces = (near[of].any(axis=1) for of in corners)
+        edges, faces = np.flatnonzero(near_edges), np.flatnonzero(near_faces)
         phase, candidates = ipctk.LBVH(), ipctk.Candidates()
         phase.can_vertices_collide = self.mesh.can_collide
         parts = (
@@ -225,11 +215,12 @@ class Barrier:
         met = [(pair.face_id, pair.vertex_id) for pair in phase.detect_face_vertex_candidates()]
         candidates.fv_candidates = [ipctk.FaceVertexCandidate(faces[i], j) for i, j in met]
         sets = [candidates]
-        for kinds in self._creased:
+        for crease in self.creases[1:]:
+            (face, vertex), pairs = crease.faces, crease.candidates
+            meet, cross = near_faces[face] | near[vertex], near_edges[crease.edges].any(axis=0)
             sets.append(ipctk.Candidates())
-            sets[-1].fv_candidates, sets[-1].ee_candidates = (
-                [pairs[i] for i in np.flatnonzero(near[of].any(axis=1))] for pairs, of in kinds
-            )
+            sets[-1].fv_candidates = list(compress(pairs.fv_candidates, meet))
+            sets[-1].ee_candidates = list(compress(pairs.ee_candidates, cross))
         return tuple(map(CandidateSet, sets))
 
     def contacts(self, sets: CandidateSets, points: Positions) -> ContactSets:

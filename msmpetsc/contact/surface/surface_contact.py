@@ -199,7 +199,8 @@ class SurfaceContactAt:
         difference of energies would lose its digits.
         """
         before, after, friction = base.pairs, self.pairs, self.step.friction
-        is_small, of_friction = self._is_near(base), 0.0
+        gone, of_friction = np.abs(after.points - before.points).max(initial=0.0), 0.0
+        is_small = self.step.comm.bcast(gone < SMALL * self.contacts.law.distance)
         moved = self.contacts.points.moved(after.q - before.q) if is_small else None
         if friction:
             of_friction = friction.change(after.points, before.points, moved)
@@ -207,11 +208,6 @@ class SurfaceContactAt:
             mean = 0.5 * (base._pushes() + self._pushes())
             return of_friction + float(np.vdot(mean, moved))
         return of_friction + self._energy() - base._energy()
-
-    def _is_near(self, base: "SurfaceContactAt") -> bool:
-        """Return whether points move too little from base for a difference of energies."""
-        gone = np.abs(self.pairs.points - base.pairs.points).max(initial=0.0)
-        return bool(self.step.comm.bcast(gone < SMALL * self.contacts.law.distance))
 
     def _energy(self) -> float:
         """Return the energy [J] of the barrier on rank 0, else 0."""
@@ -321,14 +317,9 @@ class SurfaceContactAt:
         projected : project the Hessian of each pair to be positive semidefinite
         duals     : (a, 3) duals of friction; None for the true Hessian of friction
         """
-        return self._on_nodes(self._whole_hessian(projected, duals)) if self.presses else None
-
-    def _on_nodes(self, whole: csr_array | None) -> SurfaceHessian:
-        """Return the Hessian of the points in contact, from all points' (3 total, 3 total) [N/m].
-
-        whole : on rank 0, None elsewhere
-        """
-        touched, points = None, None
+        if not self.presses:
+            return None
+        whole, touched, points = self._whole_hessian(projected, duals), None, None
         if whole is not None:
             rows = whole.indptr[: 3 * self.contacts.points.bodies + 1]
             touched = np.flatnonzero(np.diff(rows).reshape(-1, 3).any(axis=1))
@@ -343,23 +334,16 @@ class SurfaceContactAt:
         The diagonal of row sums r bounds the negative part on points. The bound on nodes follows
         from (sum w v)^2 <= (sum |w|) (sum |w| v^2).
         """
-        points = self.contacts.points
-        touched, sums = self.step.comm.bcast(self._negative_part())
+        points, touched, sums = self.contacts.points, None, None
+        whole, kept = (self._whole_hessian(projected, None) for projected in (False, True))
+        if whole is not None and kept is not None:
+            part = np.abs((kept - whole)[: 3 * points.bodies, : 3 * points.bodies])
+            sums = np.asarray(part.sum(axis=1)).reshape(-1, 3).max(axis=1)
+            touched = np.flatnonzero(sums)
+            sums = sums[touched]
+        touched, sums = self.step.comm.bcast((touched, sums))
         bound: Floats = points.spread * (np.abs(points.carried(touched)).T @ sums)
         return bound
-
-    def _negative_part(self) -> tuple[Indices, Floats] | None:
-        """Return points (k,) at which the Hessian has a negative part, and its row sums (k,) [N/m].
-
-        On ranks above 0, return None.
-        """
-        whole, kept = (self._whole_hessian(projected, None) for projected in (False, True))
-        if whole is None or kept is None:
-            return None
-        own = 3 * self.contacts.points.bodies
-        sums = np.asarray(np.abs((kept - whole)[:own, :own]).sum(axis=1)).reshape(-1, 3).max(axis=1)
-        touched = np.flatnonzero(sums)
-        return touched, sums[touched]
 
     def _whole_hessian(self, projected: bool, duals: Rows | None) -> csr_array | None:
         """Return the Hessian (3 total, 3 total) [N/m] of all points on rank 0, else None.

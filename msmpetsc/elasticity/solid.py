@@ -51,7 +51,7 @@ from msmpetsc.elasticity.vectors import Vector, cofactors, combined
 from msmpetsc.lattice.cell_moments import slopes_and_modes
 from msmpetsc.lattice.lattice import Lattice
 
-# number of a cell's constants for bounds of concavity [-]; see ``concavity_constants``
+# number of a cell's constants for bounds of concavity [-]; see ``_concavity_constants``
 BOUNDS = 18
 # indices of C, by rows, among a cell's constants [-]
 COVARIANCE = [6, 11, 10, 11, 7, 9, 10, 9, 8]
@@ -61,24 +61,6 @@ COVARIANCE = [6, 11, 10, 11, 7, 9, 10, 9, 8]
 def _row_of(cells: CellRows, i: int, a: int) -> int:
     """Return the row that corner a of cell i adds to."""
     return int(cells.nodes[i, a]) if cells.by_node else (i // LANES * 8 + a) * LANES + i % LANES
-
-
-def concavity_constants(constants: Rows) -> Rows:
-    """Return cells' constants (k, BOUNDS * LANES) for bounds of the Hessian's negative part.
-
-    A cell's constants are the shares of its eight corners in |G|^2 and in |h|^2, then the least and
-    the greatest eigenvalue of C.
-
-    constants : (k, ROWS * LANES) rows of ``CellBlocks.constants``
-    """
-    of_cells = constants.reshape(-1, ROWS, LANES).swapaxes(1, 2).reshape(-1, ROWS)
-    slopes, modes = slopes_and_modes(of_cells[:, :6])
-    spectrum = np.linalg.eigvalsh(of_cells[:, COVARIANCE].reshape(-1, 3, 3))
-    least, greatest = spectrum[:, :1].clip(0), spectrum[:, 2:]
-    columns = _shares(slopes), _shares(modes[:, :3]), least, greatest
-    rows = np.concatenate(columns, axis=1).astype(np.float32).reshape(-1, LANES, BOUNDS)
-    interleaved: Rows = rows.swapaxes(1, 2).reshape(-1, BOUNDS * LANES)
-    return interleaved
 
 
 def _shares(operators: Rows) -> Rows:
@@ -101,7 +83,7 @@ def _add_concavity(
 ) -> None:
     """Add each cell's share of the concavity bound to its corners.
 
-    c : ``concavity_constants``, flat
+    c : ``NeoHookean._concavity_constants``, flat
     """
     for i in range(first, count, step):
         k, e = constants_at(cells, i), strains_at(q, cells, i)
@@ -211,7 +193,19 @@ class NeoHookean:
 
     @cached_property
     def _concavity_constants(self) -> Rows:
-        return like(self.blocks.nodes, concavity_constants(to_host(self.blocks.constants)))
+        """Constants (k, BOUNDS * LANES) of cells for bounds of the Hessian's negative part.
+
+        They are the shares of a cell's eight corners in |G|^2 and in |h|^2, then the least and the
+        greatest eigenvalue of C.
+        """
+        constants = to_host(self.blocks.constants).reshape(-1, ROWS, LANES)
+        of_cells = constants.swapaxes(1, 2).reshape(-1, ROWS)
+        slopes, modes = slopes_and_modes(of_cells[:, :6])
+        spectrum = np.linalg.eigvalsh(of_cells[:, COVARIANCE].reshape(-1, 3, 3))
+        least, greatest = spectrum[:, :1].clip(0), spectrum[:, 2:]
+        columns = _shares(slopes), _shares(modes[:, :3]), least, greatest
+        rows = np.concatenate(columns, axis=1).astype(np.float32).reshape(-1, LANES, BOUNDS)
+        return like(self.blocks.nodes, rows.swapaxes(1, 2).reshape(-1, BOUNDS * LANES))
 
     @property
     def stiffest(self) -> float:

@@ -23,8 +23,8 @@ import numpy as np
 from msmpetsc.backend.arrays import Array, Floats, Indices, Positions, Rows, like, on_host, to_host
 from msmpetsc.backend.kernel import kernel, njit
 from msmpetsc.elasticity.cell_strain import Four
-from msmpetsc.elasticity.vectors import Vector, dot, vector
-from msmpetsc.lattice.lattice import Lattice
+from msmpetsc.elasticity.vectors import Vector, added, dot, vector
+from msmpetsc.lattice.lattice import Lattice, Springs
 
 # product(v, result) adds (Hessian) v [N] to ``result``
 Product = Callable[[Array, Array], None]
@@ -33,20 +33,6 @@ Product = Callable[[Array, Array], None]
 SYMMETRIC = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
 # smallest length to divide by [m]; a spring of zero length then has no force
 TINY = 1e-300
-
-
-@njit()
-def spring_change(before: Vector, d: Vector, r: float, k: float) -> float:
-    """Return the change [J] of a spring's energy 1/2 k (|e| - r)^2 (Eq. 13), e = before + d.
-
-    The change of length, d . (e + before) / (|e| + |before|), is accurate for a small d.
-    """
-    e = before[0] + d[0], before[1] + d[1], before[2] + d[2]
-    total = math.sqrt(dot(e, e)) + math.sqrt(dot(before, before))
-    elongation = (
-        d[0] * (e[0] + before[0]) + d[1] * (e[1] + before[1]) + d[2] * (e[2] + before[2])
-    ) / max(total, TINY)
-    return 0.5 * k * elongation * (total - 2.0 * r)
 
 
 @njit()
@@ -77,22 +63,10 @@ def block_product(c: float, e: Vector, d: Vector) -> Vector:
     return c * d[0] + along * e[0], c * d[1] + along * e[1], c * d[2] + along * e[2]
 
 
-class Springs(NamedTuple):
-    """Local end nodes (s, 2), rest lengths (s,) [m] and stiffnesses (s,) [N/m] of springs."""
-
-    ends: Indices
-    rest_length: Floats
-    stiffness: Floats
-
-    @classmethod
-    def of_lattice(cls, lattice: Lattice, first: int | None = None) -> "Springs":
-        """Return the first ``first`` springs of a lattice, or all, on the device of its nodes."""
-        return cls(
-            *(
-                like(lattice.nodes, a[:first])
-                for a in (lattice.springs, lattice.rest_length, lattice.stiffness)
-            )
-        )
+def springs_of(lattice: Lattice, first: int | None = None) -> Springs:
+    """Return the first ``first`` springs of a lattice, or all, on the device of its nodes."""
+    arrays = lattice.springs, lattice.rest_length, lattice.stiffness
+    return Springs(*(like(lattice.nodes, array[:first]) for array in arrays))
 
 
 def crushing_energy(lattice: Lattice) -> float:
@@ -110,7 +84,9 @@ def crushing_energy(lattice: Lattice) -> float:
 def _elastic_change(
     first: int, count: int, step: int, sums: Floats, springs: Springs, path: tuple[Rows, Rows]
 ) -> None:
-    """Write E(base + moved) - E(base) [J] to ``sums``.
+    """Write E(base + moved) - E(base) [J] to ``sums``, with E = 1/2 k (|e| - r)^2 (Eq. 13).
+
+    The change of |e| from e to e' = e + d, d . (e' + e) / (|e'| + |e|), is accurate for a small d.
 
     path : ``moved`` and ``base``, (l, 3) [m]
     """
@@ -121,7 +97,10 @@ def _elastic_change(
         before = vector(base, ends[s, 1], ends[s, 0])
         # The difference of two springs would lose the digits of a small displacement.
         d = vector(moved, ends[s, 1], ends[s, 0])
-        change += spring_change(before, d, rest_length[s], stiffness[s])
+        e = added(before, d)
+        lengths = math.sqrt(dot(e, e)) + math.sqrt(dot(before, before))
+        elongation = dot(d, added(e, before)) / max(lengths, TINY)
+        change += 0.5 * stiffness[s] * elongation * (lengths - 2.0 * rest_length[s])
     if first < count:
         sums[first] = change
 
@@ -156,7 +135,7 @@ class SpringScatter(OwnedSprings):
     @classmethod
     def of_lattice(cls, lattice: Lattice) -> "SpringScatter":
         """Return the springs of a lattice whose arrays are in CPU memory."""
-        return cls(Springs.of_lattice(lattice, lattice.springs_owned), Springs.of_lattice(lattice))
+        return cls(springs_of(lattice, lattice.springs_owned), springs_of(lattice))
 
     def add_gradient(self, q: Positions, gradient: Rows) -> None:
         """Add grad E [N] to ``gradient`` (l, 3)."""
@@ -319,7 +298,7 @@ class SpringGather(OwnedSprings):
         stiffness = np.append(np.tile(to_host(lattice.stiffness), 2), 0.0)[rows]
         sent = partial(like, lattice.nodes)
         around = Around(sent(neighbour), sent(kinds), sent(stiffness), sent(lengths))
-        return cls(Springs.of_lattice(lattice, lattice.springs_owned), around)
+        return cls(springs_of(lattice, lattice.springs_owned), around)
 
     def _sum_around(self, loop: Callable[..., None], rows: Array, q: Positions) -> None:
         loop(self.around.neighbour.shape[1], rows, AroundAt(self.around, q))

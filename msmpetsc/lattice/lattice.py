@@ -30,32 +30,32 @@ from msmpetsc.scene.body import Material
 NO_CELLS = np.empty((0, 8), np.int64)
 
 
-class MadeSprings(NamedTuple):
-    """Local ends (s, 2), rest length (s,) [m] and stiffness (s,) [N/m] of springs."""
+class Springs(NamedTuple):
+    """Local ends (s, 2), rest lengths (s,) [m] and stiffnesses (s,) [N/m] of springs."""
 
     ends: Indices
     rest_length: Floats
     stiffness: Floats
 
     @classmethod
-    def of(cls, net: SpringNet, h: float, stiffness: Floats) -> "MadeSprings":
+    def of(cls, net: SpringNet, h: float, stiffness: Floats) -> "Springs":
         """Return the springs of a net on cells of size h [m]."""
         return cls(net.ends, h * np.sqrt(DIRECTION_KIND[net.direction]), stiffness)
 
 
-NO_SPRINGS = MadeSprings(np.empty((0, 2), np.int32), np.empty(0), np.empty(0))
+NO_SPRINGS = Springs(np.empty((0, 2), np.int32), np.empty(0), np.empty(0))
 
 
 def _springs_of_solid(
     net: Topology, h: float, order: Indices | slice, solid: SolidCells
-) -> MadeSprings:
+) -> Springs:
     """Return the springs whose L bounds a solid's Hessian at rest.
 
     order : (d,) row of ``solid`` for each cell of the topology
     """
     springs = net.springs()
     cells = SolidCells(*(to_host(rows)[order] for rows in solid))
-    return MadeSprings.of(springs, h, stiffness_of_solid(net, springs, h, cells))
+    return Springs.of(springs, h, stiffness_of_solid(net, springs, h, cells))
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class Lattice:
     volumetric: str = "quadratic"
     viscous: float = 0.0
     pressed: tuple[Any, ...] = ()
-    make_springs: Callable[[SolidCells], MadeSprings] | None = None
+    make_springs: Callable[[SolidCells], Springs] | None = None
 
     @property
     def owned(self) -> int:
@@ -200,7 +200,7 @@ def build_lattice(
     else:
         found = net.springs()
         law, springs_owned = law_of_springs(net, found, h, material, of_cells), found.owned
-        springs = MadeSprings.of(found, h, law.springs)
+        springs = Springs.of(found, h, law.springs)
     grids = cages.grids
     nodes_of_bodies = np.bincount(
         grids.body_of(net.ijk[: len(law.mass)]), minlength=len(grids.grids)

@@ -5,11 +5,11 @@ import pytest
 
 from msmpetsc.elasticity.springs import (
     OwnedSprings,
-    Springs,
     add_elastic_gradient,
     add_elastic_product,
     elastic_hessian,
 )
+from msmpetsc.lattice.lattice import Springs
 
 RNG = np.random.default_rng(5)
 N = 12

@@ -103,8 +103,8 @@ class Penalty:
         """Return q_n and a q_(n-1) (n, 3) [m] that scales the normal velocity of striking nodes.
 
         A node strikes in the step in which it reaches a face. In explicit steps its depth is scaled
-        as well. Otherwise the penalty would reverse the velocity that belongs to the depth, which
-        near the stability limit may be 2.6 times the velocity of the impact.
+        as well. Otherwise the penalty would push the node out. Near the stability limit that gives
+        up to 2.6 times the velocity of the impact.
         """
         if self.restitution is None:
             return q, q_previous

@@ -17,7 +17,8 @@ from msmpetsc.backend.arrays import Indices, Mask, Rows, to_host
 from msmpetsc.contact.surface.surface_contact import SurfaceHessian
 from msmpetsc.elasticity.pressure import PressureHessian
 from msmpetsc.elasticity.solid import CellHessians
-from msmpetsc.elasticity.springs import Springs, elastic_hessian
+from msmpetsc.elasticity.springs import elastic_hessian
+from msmpetsc.lattice.lattice import Springs
 from msmpetsc.solve.linear.operators import TrueHessian
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.petsc.library import preallocate_coo, refuse_nonzeros, set_values_coo

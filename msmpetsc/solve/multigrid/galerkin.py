@@ -30,10 +30,11 @@ from msmpetsc.elasticity.cell_threads import constants_at, state_at
 from msmpetsc.elasticity.energy import Elasticity
 from msmpetsc.elasticity.neo_hookean import kept_gradient
 from msmpetsc.elasticity.solid import CellHessians
-from msmpetsc.elasticity.springs import SYMMETRIC, Springs, spring_block
+from msmpetsc.elasticity.springs import SYMMETRIC, spring_block
 from msmpetsc.elasticity.vectors import Three, cofactors, combined, cross, scaled
 from msmpetsc.geometry.grid import CORNERS
 from msmpetsc.geometry.morton import COPIES, decode_morton, encode_morton
+from msmpetsc.lattice.lattice import Springs
 from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.coarse_copies import DIGITS, MOST_COPIES, in_cells
 from msmpetsc.solve.multigrid.grids import CoarseGrid

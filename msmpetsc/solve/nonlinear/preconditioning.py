@@ -6,6 +6,9 @@ iterations for any kappa, but each iteration costs several times as much. So sho
 Jacobi's preconditioner, and longer steps use multigrid.
 """
 
+import math
+import sys
+
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -299,4 +302,4 @@ class LatticePreconditioner(StepPreconditioner):
 
 def _digits(reached: float) -> float:
     """Return the number of digits in a reduction of the residual to ``reached``, at least 0.1."""
-    return max(-float(np.log10(max(reached, np.finfo(float).eps))), 0.1)
+    return max(-math.log10(max(reached, sys.float_info.epsilon)), 0.1)

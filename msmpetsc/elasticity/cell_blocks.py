@@ -132,18 +132,16 @@ def whole_rows(rows: Rows) -> Array:
     )
 
 
-def add_corners(write: Callable[[Rows], None], around: Indices, corners: int, rows: Rows) -> None:
-    """Add the results of a loop over cell corners to the rows (l, k) of nodes.
+def add_corners(write: Callable[[Rows], None], blocks: CellBlocks, rows: Rows) -> None:
+    """Add the results of a loop over the corners of all cells to the rows (l, k) of nodes.
 
     On a CPU ``write`` adds to ``rows``. On a GPU it writes a row per corner, and each owned node
     sums the rows of its corners.
-
-    around : (w, owned) rows of each owned node (see ``rows_of``)
     """
     if on_host(rows):
         write(rows)
         return
     # The last row stays zero: ``around`` refers to it if a node has fewer corners.
-    own = np.zeros((corners + 1, rows.shape[1]), like=rows)
+    own, around = np.zeros((blocks.nodes.size + 1, rows.shape[1]), like=rows), blocks.around
     write(own)
     rows[: around.shape[1]] += own[around].sum(axis=0)

@@ -152,9 +152,7 @@ class CellHessians:
         """
         cells = one_by_one(self.blocks, self.state)
         count = len(cells.nodes)
-        add_corners(
-            lambda rows: _add_diagonal(count, rows, cells), self.blocks.around, 8 * count, diagonal
-        )
+        add_corners(lambda rows: _add_diagonal(count, rows, cells), self.blocks, diagonal)
 
 
 @dataclass(frozen=True)
@@ -235,14 +233,8 @@ class NeoHookean:
     def add_concavity(self, q: Positions, concavity: Floats) -> None:
         """Add a bound of the Hessian's negative part to ``concavity`` (l,) [N/m]."""
         cells, c = one_by_one(self.blocks), self._concavity_constants.ravel()
-        of_nodes = concavity.reshape(-1, 1)
-        count = len(cells.nodes)
-        add_corners(
-            lambda rows: _add_concavity(count, rows, cells, c, q),
-            self.blocks.around,
-            8 * count,
-            of_nodes,
-        )
+        count, of_nodes = len(cells.nodes), concavity.reshape(-1, 1)
+        add_corners(lambda rows: _add_concavity(count, rows, cells, c, q), self.blocks, of_nodes)
 
     def hessian_at(self, q: Positions, projected: bool, dtype: type = np.float64) -> CellHessians:
         """Return the Hessian of E at q (l, 3) [m]; positive semidefinite if ``projected``."""

@@ -24,6 +24,7 @@ from msmpetsc.geometry.surface import Surface, examine
 from msmpetsc.scene.reading import load_scene
 
 BOX = trimesh.creation.box(extents=[1, 2, 3])
+TETRAHEDRA = [[0, *edge, 7] for edge in [(4, 6), (6, 2), (2, 3), (3, 1), (1, 5), (5, 4)]]
 QUADS = b"""mtllib paint.mtl
 v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nv 0 0 1\nv 1 0 1\nv 1 1 1\nv 0 1 1
 f 1 4 3 2\nf 5 6 7 8\nf 1/1 2/1 6/1 5/1\nf 2//1 3//1 7//1 6//1\nf 3 4 8 7\nf -8 -4 -1 -5\n"""
@@ -40,11 +41,12 @@ def exported(**options) -> bytes:
     return content.encode() if isinstance(content, str) else content
 
 
-def by_meshio(kind: str, **options) -> bytes:
-    """Return the bytes of a mesh in a file that meshio writes."""
+def by_meshio(kind: str, cells: str = "triangle", **options) -> bytes:
+    """Return the bytes of a mesh of triangles or tetrahedra in a file that meshio writes."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, f"x.{kind}")
-        meshio.Mesh(BOX.vertices, [("triangle", BOX.faces)]).write(path, **options)
+        corners = BOX.faces if cells == "triangle" else TETRAHEDRA
+        meshio.Mesh(BOX.vertices, [(cells, corners)]).write(path, **options)
         return path.read_bytes()
 
 
@@ -100,6 +102,8 @@ SEEDS = [
     ("msh", by_meshio("msh", file_format="gmsh22")),
     ("inp", by_meshio("inp")),
     ("bdf", by_meshio("bdf")),
+    *((kind, by_meshio(kind, "tetra")) for kind in ("vtk", "vtu", "inp", "bdf")),
+    ("msh", by_meshio("msh", "tetra", file_format="gmsh")),
 ]
 
 

@@ -4,7 +4,7 @@ Static problems and eigenfrequencies use the Hessian of E at rest. All errors ar
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -59,14 +59,14 @@ def lattice_of(
     body = body_of(mesh)
     body.bounds[0] -= h * np.array(offset)
     cages = fill([body], h, boundary=boundary)
-    law = (
-        {"law": "linear"}
-        if poisson is SPRINGS
-        else {"law": "neo-hookean", "poisson_ratio": poisson}
-    )
-    return build_lattice(
-        cages, Material.model_validate({"density": DENSITY, "young_modulus": E} | law)
-    )
+    material = {"density": DENSITY, "young_modulus": E} | law_of(poisson)
+    return build_lattice(cages, Material.model_validate(material))
+
+
+def law_of(poisson: float | None) -> dict[str, Any]:
+    """Return the law of a neo-Hookean solid of Poisson's ratio, or of springs."""
+    springs = {"law": "linear"}
+    return springs if poisson is SPRINGS else {"law": "neo-hookean", "poisson_ratio": poisson}
 
 
 def box(cells: Iterable[int], cell_size: float, poisson: float | None = SPRINGS) -> Lattice:

@@ -10,7 +10,7 @@ import manifold3d
 import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
-from small_strain import SPRINGS
+from small_strain import SPRINGS, law_of
 
 import msmpetsc
 from msmpetsc.fields import Frame
@@ -49,11 +49,6 @@ def run(mesh: trimesh.Trimesh, poisson: float | None, **tables: Any) -> Run:
 
     poisson : Poisson's ratio of a neo-Hookean solid, or SPRINGS
     """
-    law = (
-        {"law": "linear"}
-        if poisson is SPRINGS
-        else {"law": "neo-hookean", "poisson_ratio": poisson}
-    )
     with tempfile.TemporaryDirectory() as folder:
         source = Path(folder) / "body.obj"
         mesh.export(source, digits=17)
@@ -63,7 +58,7 @@ def run(mesh: trimesh.Trimesh, poisson: float | None, **tables: Any) -> Run:
             **tables,
         }
         scene["material"] = (
-            {"young_modulus": E, "density": DENSITY} | law | scene.get("material", {})
+            {"young_modulus": E, "density": DENSITY} | law_of(poisson) | scene.get("material", {})
         )
         scene = {"solver": {"error": 1e-6}, "output": {"surface": False}} | scene
         simulation = msmpetsc.Simulation(msmpetsc.Scene.of(scene))

@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 import small_strain as study
 from scipy.spatial.transform import Rotation
-from small_strain import ACROSS, hessian
+from small_strain import ACROSS
 from strains import elastic_constant, uniform_strains
-
-from msmpetsc.elasticity.energy import Elasticity
 
 lattice_beam = cache(study.lattice_beam)
 laws = pytest.mark.parametrize("poisson", study.LAWS.values(), ids=study.LAWS)
@@ -19,15 +17,6 @@ laws = pytest.mark.parametrize("poisson", study.LAWS.values(), ids=study.LAWS)
 
 
 STRAINS = {name: rest for name, *rest in uniform_strains()}
-
-
-@laws
-def test_the_matrix_is_the_products_own_hessian_at_rest(poisson: float | None):
-    lattice = study.box((4, 3, 2), 0.1, poisson)
-    v = np.random.default_rng(0).standard_normal(lattice.nodes.shape)
-    product = np.zeros_like(v)
-    Elasticity(lattice).hessian_at(lattice.nodes).add_product(v, product)
-    np.testing.assert_allclose((hessian(lattice) @ v.ravel()).reshape(-1, 3), product, atol=1e-9)
 
 
 @laws

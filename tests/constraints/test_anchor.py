@@ -15,7 +15,6 @@ from msmpetsc.scene.reading import load_scene
 
 T = 0.01
 LEFT = {"box": [[0, 0, 0], [0.01, 0.5, 0.25]]}
-RIGHT = {"box": [[0.49, 0, 0], [0.5, 0.5, 0.25]]}
 # 0.4 m/s; then 0.2 m/s sideways and upwards
 UP = [
     {"time": 0.05, "by": [0, 0, 0.02]},

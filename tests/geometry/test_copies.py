@@ -12,7 +12,6 @@ import pytest
 import trimesh
 from block_scene import play, solid_of, write_scene
 from conftest import result_on
-from mpi4py import MPI
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, shortest_path
 from surfaces import body_of
@@ -30,7 +29,6 @@ H = 0.1
 LENGTH, BASE, WIDTH, DEPTH = 20, 4, 5, 2
 # [Pa], [N]
 YOUNG, FORCE = 1e6, 0.5
-COMM = MPI.COMM_SELF
 
 
 def box(low: list[float], high: list[float]) -> trimesh.Trimesh:

@@ -99,7 +99,7 @@ class Barrier:
 
         ipctk.set_num_threads(1)
         ipctk.set_logger_level(ipctk.LoggerLevel.off)
-        self.ipctk, self.law, self._bodies = ipctk, law, bodies
+        self.ipctk, self.law = ipctk, law
         triangles = np.asfortranarray(surface.triangles, np.int32)
         edges = np.asfortranarray(ipctk.edges(triangles), np.int32)
         self.mesh = ipctk.CollisionMesh(np.asfortranarray(surface.points), edges, triangles)

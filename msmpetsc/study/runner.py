@@ -5,7 +5,7 @@ import shutil
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Lock
@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from msmpetsc.errors import InputError
+from msmpetsc.errors import InputError, printable
+from msmpetsc.results.disk import Lock as FileLock
 from msmpetsc.results.disk import write_whole
 from msmpetsc.study.cases import Case, command, shown_command, study_cases
 from msmpetsc.study.metrics import (
@@ -155,7 +156,10 @@ def run_study(
     part    : (i, n): run and return only part i of n, counted from 1, in its own folder
 
     ``folder`` gets table.csv, study.toml and references/. Rows of earlier runs and of parts are
-    kept if their cases are still in the file. Raises InputError before the first run.
+    kept if their cases are still in the file.
+
+    Raises InputError before the first run, also if another process runs a study in this folder, or
+    if cases of another study would be dropped.
     """
     require_extra()
     study = load_study(path)
@@ -165,24 +169,28 @@ def run_study(
         wanted = np.array_split(wanted, part[1])[part[0] - 1].tolist()
         own = part_folder(folder, part)
     own.mkdir(parents=True, exist_ok=True)
-    if restart:
-        (own / "table.csv").unlink(missing_ok=True)
-        for name in ("runs", "references", PARTS):
-            shutil.rmtree(own / name, ignore_errors=True)
-    known = [own] if restart else [own, folder, *sorted((folder / PARTS).glob("*"))]
-    kept = {case: every[case] for case in wanted} if part else every
-    rows = _continued(known, kept)
+    with ExitStack() as lock:
+        lock.callback(FileLock(own / "table.csv").free)
+        if restart:
+            (own / "table.csv").unlink(missing_ok=True)
+            for name in ("runs", "references", PARTS):
+                shutil.rmtree(own / name, ignore_errors=True)
+        else:
+            _refuse_other_study(own, path.stem, every)
+        known = [own] if restart else [own, folder, *sorted((folder / PARTS).glob("*"))]
+        kept = {case: every[case] for case in wanted} if part else every
+        rows = _continued(known, kept)
 
-    def add(*measured: Row) -> None:
-        rows.update({row["case"]: row for row in measured})
-        write_table(own, [rows[case] for case in kept if case in rows])
+        def add(*measured: Row) -> None:
+            rows.update({row["case"]: row for row in measured})
+            write_table(own, [rows[case] for case in kept if case in rows])
 
-    write_whole(own / "study.toml", path.read_bytes())
-    add()
-    todo = [every[case] for case in wanted if not _is_done(every[case], rows)]
-    bench = Bench(own, Processes(), path.stem)
-    _carry_out(bench, todo, add, jobs=jobs or study.jobs, done=len(wanted) - len(todo))
-    return [rows[case] for case in wanted]
+        write_whole(own / "study.toml", path.read_bytes())
+        add()
+        todo = [every[case] for case in wanted if not _is_done(every[case], rows)]
+        bench = Bench(own, Processes(), path.stem)
+        _carry_out(bench, todo, add, jobs=jobs or study.jobs, done=len(wanted) - len(todo))
+        return [rows[case] for case in wanted]
 
 
 def list_study(path: Path, folder: Path, full: bool = False) -> list[tuple[Case, bool]]:
@@ -248,6 +256,16 @@ def _continued(folders: Sequence[Path], by_id: dict[str, Case]) -> dict[str, Row
         new = {case: row for case, row in rows.items() if not _is_done(by_id[case], known)}
         known |= {case: row | {"label": by_id[case].label} for case, row in new.items()}
     return known
+
+
+def _refuse_other_study(folder: Path, study: str, cases: dict[str, Case]) -> None:
+    """Raise InputError if the folder's table has cases of another study that would be dropped."""
+    rows = [row for row in _earlier_rows(folder) if row["case"] not in cases]
+    if others := {row["study"] for row in rows} - {study}:
+        raise InputError(
+            f"{folder / 'table.csv'} has cases of the study {printable(min(others), 60)}: "
+            "name another folder by -o, or --restart replaces them"
+        )
 
 
 def _earlier_rows(folder: Path) -> list[Row]:

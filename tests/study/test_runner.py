@@ -71,6 +71,37 @@ def test_parts_run_apart_and_are_joined(tmp_path: Path, stand_in):
     assert rows == [*chain.from_iterable(parts)]
 
 
+def test_cases_of_another_study_are_not_dropped(tmp_path: Path, stand_in):
+    text = ONE_SCENE + '[[sweep]]\npresets = ["newton"]\nerrors = '
+    (row,) = carry_out(tmp_path, text + "[0.1]")
+    other = study_file(tmp_path, text + "[0.2]").rename(tmp_path / "other.toml")
+    words = f"table.csv has cases of the study {row['study']}: name another folder by -o"
+    assert words in command_error("study", other, "-o", tmp_path / "out")
+    assert records(read_table(tmp_path / "out")) == [row]
+    # a study that has a new name and the same cases goes on
+    other.write_text(text + "[0.1, 0.2]")
+    assert run_study(other, tmp_path / "out")[0] == row
+
+
+def test_two_studies_do_not_share_a_folder_at_a_time(tmp_path: Path, stand_in):
+    path, out = (
+        study_file(tmp_path, ONE_SCENE + '[[sweep]]\npresets = ["newton"]'),
+        tmp_path / "out",
+    )
+    out.mkdir()
+    holder = "import sys; from pathlib import Path; from msmpetsc.results.disk import Lock\n"
+    holder += "lock = Lock(Path(sys.argv[1])); print(flush=True); input()"
+    words = [sys.executable, "-c", holder, str(out / "table.csv")]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(words, env=ENVIRONMENT, stdin=pipe, stdout=pipe) as other:
+        other.stdout.readline()
+        with pytest.raises(InputError, match=r"table\.csv is being written by another run"):
+            run_study(path, out, restart=True)
+        assert not (out / "study.toml").exists()
+        other.communicate(b"\n")
+    assert len(run_study(path, out)) == 1 and not list(out.glob(".*"))
+
+
 @pytest.mark.parametrize("part", ["3", "0/3", "4/3", "a/3"])
 def test_a_part_that_is_none_is_refused(tmp_path: Path, own_log, part: str):
     path = study_file(tmp_path, ONE_SCENE + "[[sweep]]")

@@ -31,6 +31,11 @@ if TYPE_CHECKING:
     from msmpetsc.scene.reading import Scene
 
 File = str | os.PathLike[str]
+# types of options that argparse gives as words
+KINDS: dict[str, tuple[type, ...]] = {
+    "set": (Mapping, Sequence),
+    "petsc_options": (str, Mapping),
+}
 # largest whole number of an option [-]; a double holds every whole number up to it
 MOST = 2**53
 
@@ -151,6 +156,10 @@ class RunRequest:
                 raise InputError(f"{flag_of(name)} must be at most {MOST}, not {value}")
             if choices and value not in (None, *choices):
                 raise InputError(f"{flag_of(name)} is {' or '.join(choices)}, not {value!r}")
+        for name, kinds in KINDS.items():
+            if not isinstance(value := getattr(self, name), kinds):
+                said = " or ".join(kind.__name__ for kind in kinds)
+                raise InputError(f"{name} must be {said}, not {printable(repr(value), 60)}")
         refuse_other_format("-o", self.output, RESULT_NAMES)
         refuse_other_format("--measure", self.measure, MEASURE_NAMES)
         if self.export_steps and not self.export:
@@ -225,7 +234,7 @@ def steps_in(text: str) -> tuple[int, ...]:
     """
     words = [word.strip() for word in str(text or 1).split(",")]
     if not all(word.isdecimal() and 0 < int(word) < 10**9 for word in words):
-        raise InputError(f"--export-steps takes numbers like 1,5,20, not {printable(text, 40)!r}")
+        raise InputError(f"--export-steps takes numbers like 1,5,20, not {printable(str(text), 40)!r}")
     return tuple(map(int, words))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from msmpetsc.backend.arrays import Floats, Indices, Mask, Positions, Rows, like, to_host
 from msmpetsc.constraints.time_functions import Lines, Timed
 from msmpetsc.elasticity.pressure import Pressures
-from msmpetsc.errors import InputError
+from msmpetsc.errors import InputError, printable
 from msmpetsc.extensions import ForceFunction
 from msmpetsc.lattice.lattice import Lattice
 
@@ -81,14 +81,23 @@ class OwnForce(Varying):
     def force_at(self, q: Positions, v: Rows, time: float) -> Rows:
         """Return the force (owned, 3) [N] at positions q and velocities v (owned, 3).
 
-        Raises InputError if the function's result has a wrong shape or is not finite.
+        Raises InputError if the function's result is no array of finite real numbers, or has a
+        wrong shape.
         """
         force = np.zeros((len(q), 3))
         if not len(self.rows):
             return force
         # a user's function may divide by zero: the result is checked below
         with np.errstate(all="warn"):
-            per_mass = np.asarray(self.function(q[self.rows], v[self.rows], time), float)
+            returned = self.function(q[self.rows], v[self.rows], time)
+        try:
+            per_mass = np.asarray(returned)
+            is_real = per_mass.dtype.kind in "biuf"
+        except ValueError:
+            is_real = False
+        if not is_real:
+            words = f"returned {printable(repr(returned), 60)}, no array of real numbers"
+            raise InputError(f"{self.key}.function: {words}")
         try:
             force[self.rows] = self.mass[:, None] * np.broadcast_to(per_mass, (len(self.rows), 3))
         except ValueError:

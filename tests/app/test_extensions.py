@@ -130,6 +130,9 @@ WRONG = {
         "function": "drga"
     },
     "force.0.function: returned numbers of shape (2,), not (75, 3)": {"function": "flat"},
+    "force.0.function: returned 'abc', no array of real numbers": {"function": "text"},
+    "force.0.function: returned [[1], [1, 2]], no array of real numbers": {"function": "ragged"},
+    "force.0.function: returned 1j, no array of real numbers": {"function": "complex"},
     "force.0.function: returned numbers that are not finite (t = 0 s)": {"function": "nan"},
     "must give exactly one of total, function; has total and function": {
         "function": "drag",
@@ -142,6 +145,9 @@ WRONG = {
 def test_what_is_no_force_is_said_in_one_line(tmp_path: Path, words: str):
     msm.register_force("drag", lambda x, v, t: -v)
     msm.register_force("flat", lambda x, v, t: np.zeros(2))
+    msm.register_force("text", lambda x, v, t: "abc")
+    msm.register_force("ragged", lambda x, v, t: [[1], [1, 2]])
+    msm.register_force("complex", lambda x, v, t: 1j)
     msm.register_force("nan", lambda x, v, t: np.full_like(x, np.nan))
     scene = flying(tmp_path, "drag")
     assert words in input_error(

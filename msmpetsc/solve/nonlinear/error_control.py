@@ -33,8 +33,6 @@ from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctiona
 FULL_STEP_ERROR = 1e-5
 # Assumed ratio of the bound to the error before the first estimate [-]
 FIRST_RATIO = 5.0
-# Ratio of |F| to the last |F| above which F may be rounding of stiff contact [-]
-STAYS = 0.5
 # Factor on the goal after a doubt [-]; least goal [target], which is also the least
 # tolerance of a linear solve [ksp_rtol]
 CLOSER, CLOSEST = 0.1, 1e-3
@@ -120,8 +118,7 @@ class ErrorControl:
         """Return the outcome at an iterate, with an upper bound of its error."""
         residual = self.functional.dual_norm(iterate.f)
         distance = self.functional.distance(iterate.q)
-        stays = residual > STAYS * before.residual
-        at_rounding = self.rounding.explains(iterate, stays)
+        at_rounding = self.rounding.explains(iterate)
         alarm = min(before.alarm, Alarm.ON_THE_WAY)
         is_first = np.isinf(before.residual)
         missed = self.missed if is_first else (residual / before.residual) ** 2
@@ -146,10 +143,6 @@ class ErrorControl:
         assert now.compression is not None
         lowest = now.compression.least_curvature
         return replace(now, error=bound / lowest if lowest > 0 else np.inf)
-
-    def at_rounding(self, iterate: Iterate, now: Outcome) -> Outcome:
-        """Return the outcome at an iterate from which no step lowers g: F may be rounding."""
-        return replace(now, at_rounding=self.rounding.explains(iterate, True))
 
     def is_near(self, now: Outcome) -> bool:
         """Return whether the error may be below the goal, by the last ratio of bound to error."""

@@ -310,15 +310,13 @@ class Rounding:
                 "check gravity, force and their units"
             )
 
-    def explains(self, iterate: Iterate, with_contact: bool) -> bool:
+    def explains(self, iterate: Iterate) -> bool:
         """Return whether F is rounding alone.
 
         Rows are tested one by one, since soft parts have less rounding than stiff parts.
-
-        with_contact : whether the stiffness of contact counts; without it the test is cheaper
         """
         functional, known = self.functional, self.rows
-        if with_contact and iterate.contact:
+        if iterate.contact:
             bound = iterate.contact.bound()[functional.unknowns.free]
             known = known + np.tile(ROUNDINGS * functional.t2 * bound, 3)
         rows = np.abs(functional.memory.read(iterate.f)) / (

@@ -122,8 +122,7 @@ class Newton(StepMethod):
             share = self._limit(now)
             lower = self._search(now, outcome.is_flat)
             if lower is None and projected:
-                outcome = self.control.at_rounding(now, outcome)
-                reason = self.reason_to_end(its, outcome) or REASON.DIVERGED_LINE_SEARCH
+                reason = REASON.DIVERGED_LINE_SEARCH
                 break
             if lower is None:
                 projected = True

@@ -234,7 +234,8 @@ def steps_in(text: str) -> tuple[int, ...]:
     """
     words = [word.strip() for word in str(text or 1).split(",")]
     if not all(word.isdecimal() and 0 < int(word) < 10**9 for word in words):
-        raise InputError(f"--export-steps takes numbers like 1,5,20, not {printable(str(text), 40)!r}")
+        said = printable(str(text), 40)
+        raise InputError(f"--export-steps takes numbers like 1,5,20, not {said!r}")
     return tuple(map(int, words))
 
 

@@ -97,7 +97,7 @@ WRONG = {
     "is no name of an option": {"petsc_options": {"ksp rtol": 1e-3}},
     "petsc_options must be str or Mapping, not ['-ksp_view']": {"petsc_options": ["-ksp_view"]},
     "set must be Mapping or Sequence, not 4": {"set": 4},
-    "--export-steps takes numbers like 1,5,20, not '[1, 2]'": {"export": "systems", "export_steps": [1, 2]},
+    "numbers like 1,5,20, not '[1, 2]'": {"export": "systems", "export_steps": [1, 2]},
 }
 
 

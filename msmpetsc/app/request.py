@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from msmpetsc.scene.reading import Scene
 
 File = str | os.PathLike[str]
-# types of options that argparse gives as words
+# types of options that argparse does not convert, and that Python may mistake
 KINDS: dict[str, tuple[type, ...]] = {
     "set": (Mapping, Sequence),
     "petsc_options": (str, Mapping),

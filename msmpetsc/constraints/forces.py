@@ -151,8 +151,9 @@ class ActingForces:
         self.lattice, self.loads, self.own_forces = lattice, loads, own_forces
         self.pressures = pressures
         self.all: list[Varying] = [*loads, *own_forces, *pressures]
-        self._own = [np.zeros((0, 3))] * len(own_forces)
-        self._own_means = self._own.copy()
+        # Values of the users' functions as a step begins, and their changes since the
+        # step before
+        self._own: list[tuple[Rows, Rows]] = [(np.zeros((0, 3)),) * 2] * len(own_forces)
 
     def begin_step(
         self,
@@ -180,24 +181,23 @@ class ActingForces:
 
         for number, force in enumerate(self.own_forces):
             now = own(force, q, v, time)
-            change = 0.0 if earlier is None else now - own(force, *earlier)
-            self._own[number] = now + change
-            self._own_means[number] = now + 0.5 * change
+            before = now if earlier is None else own(force, *earlier)
+            self._own[number] = now, now - before
 
     def at(self, time: float, users: bool = True) -> ExternalForces:
         """Return the external forces at a time [s].
 
         users : whether to include the users' functions, which have no potential
         """
-        return self._with(lambda load: load.state_at(time), users)
+        return self._with(lambda load: load.state_at(time), 1.0 if users else None)
 
-    def mean(self, begin: float, end: float, through: bool = False) -> ExternalForces:
+    def mean(self, begin: float, end: float, reach: float = 1.0) -> ExternalForces:
         """Return the means of the external forces from begin to end [s].
 
-        through : whether extrapolated users' functions are taken as means, too, for their work;
-                  otherwise they have their value at the end, as in the step
+        reach : time in which the users' functions go on changing, as they did in the step before
+                [steps]: 1 as in the step, 1/2 for their mean over the step, which does their work
         """
-        return self._with(lambda load: load.mean(begin, end), through=through)
+        return self._with(lambda load: load.mean(begin, end), reach)
 
     def ahead(self, before: float, begin: float, end: float) -> ExternalForces:
         """Return (3 f - f') / 2: f is the mean from begin to end, f' from before to begin [s]."""
@@ -209,17 +209,19 @@ class ActingForces:
         return self._with(total)
 
     def _with(
-        self, total: Callable[[Varying], Floats], users: bool = True, through: bool = False
+        self, total: Callable[[Varying], Floats], reach: float | None = 1.0
     ) -> ExternalForces:
-        """Return the external forces, with ``total(load)`` as the total of each load."""
+        """Return the external forces, with ``total(load)`` as the total of each load.
+
+        reach : as in ``mean``; None to leave out the users' functions
+        """
         force = np.zeros((self.lattice.owned, 3), like=self.lattice.nodes)
         totals = [total(load) for load in self.loads]
         for load, value in zip(self.loads, totals, strict=True):
             force += load.share * like(load.share, value)
-        own_values = self._own_means if through else self._own
-        for function, own in zip(self.own_forces, own_values, strict=True):
+        for function, (own, change) in zip(self.own_forces, self._own, strict=True):
             share = float(total(function)[0])
-            if users and share and len(own):
-                force = force + share * own
+            if reach is not None and share and len(own):
+                force = force + share * (own + reach * change)
         values = [float(total(pressure)[0]) for pressure in self.pressures]
         return ExternalForces(force, Pressures([p.part for p in self.pressures], values), totals)

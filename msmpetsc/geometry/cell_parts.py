@@ -103,11 +103,9 @@ def parts_of(surface: Surface, grid: Grid, axes: Indices, volume: float) -> Cell
     part = part_of_piece[first_piece[cell] + piece]
     count = np.ones(len(keys), np.int64)
     count[several] = split.parts
-    masks = np.ones((len(keys), 6), np.uint8)
-    bits = np.where(split.faces >= 0, 1 << np.maximum(split.faces, 0), 0)
-    masks[count > 1] = np.bitwise_or.reduce(bits, axis=2)
+    sides = Sides.of_cells(count, split.faces)
     crossing = _crossing_rows(codes, keys, size, flush, ends)
-    links, separated = _links(surface, grid, keys, cell, part, crossing, count, masks, split.faces)
+    links, separated = _links(surface, grid, keys, cell, part, crossing, sides)
     kept = np.flatnonzero((count > 1) | separated)
     own = rows_of(cell, kept)
     # a triangle in the low face of a cell of a single part bounds the body below
@@ -115,7 +113,7 @@ def parts_of(surface: Surface, grid: Grid, axes: Indices, volume: float) -> Cell
     points = PartsOfPoints(
         surface, keys[kept], np.searchsorted(kept, cell[own]), triangle[own], part[own]
     )
-    return CellParts(keys, count, links, masks, separated, split.shares, split.spread, points)
+    return CellParts(keys, count, links, sides.masks, separated, split.shares, split.spread, points)
 
 
 def _rows_in_cells(
@@ -230,6 +228,28 @@ def _crossing_rows(
     return crossing
 
 
+class Sides(NamedTuple):
+    """Parts at the faces of cells, the low faces first.
+
+    masks : (b, 6) parts at each face of each cell as bit masks
+    row   : (b,) row of ``lines`` of each cell; -1 for a cell with a single part
+    lines : (m, 6, LINES^2) part at each line of a face, -1 outside the body
+    """
+
+    masks: Array
+    row: Indices
+    lines: Array
+
+    @classmethod
+    def of_cells(cls, count: Indices, lines: Array) -> "Sides":
+        """Return the sides of cells with ``count`` (b,) parts each."""
+        masks, row = np.ones((len(count), 6), np.uint8), np.full(len(count), -1)
+        bits = np.where(lines >= 0, 1 << np.maximum(lines, 0), 0)
+        masks[count > 1] = np.bitwise_or.reduce(bits, axis=2)
+        row[count > 1] = np.arange(len(lines))
+        return cls(masks, row, lines)
+
+
 def _links(
     surface: Surface,
     grid: Grid,
@@ -237,26 +257,20 @@ def _links(
     cell: Indices,
     part: Indices,
     crossing: list[Indices],
-    count: Indices,
-    masks: Array,
-    faces: Array,
+    sides: Sides,
 ) -> tuple[Links, Mask]:
     """Return the parts of neighbouring cut cells that meet, and the mask (b,) of ``separated``.
 
     cell     : (r,) cell of each row
     part     : (r,) part of each row, -1 if its piece bounds no part of the cell
     crossing : for each axis, the rows of ``_crossing_rows``
-    count    : (b,) number of parts in each cell
-    masks    : (b, 6) parts at the faces of each cell, as in CellParts
-    faces    : (m, 6, LINES^2) part at each line of each face of the m cells with several parts
     """
-    ijk, steps = unpacked(keys), np.eye(3, dtype=np.int64)
+    (masks, row, lines), ijk, steps = sides, unpacked(keys), np.eye(3, dtype=np.int64)
     beyond = np.stack([places_of(keys, packed(ijk + step)) for step in steps])
     # rows of pieces that bound parts
     bounding = [rows[:, (part[rows] >= 0).all(axis=0)] for rows in crossing]
     # the middle of an uncrossed face tells whether two cells of a single part meet
-    is_single = count == 1
-    row = np.cumsum(~is_single) - 1
+    is_single = row < 0
     asked = (beyond >= 0) & is_single & is_single[beyond]
     for axis, (below, _) in enumerate(bounding):
         asked[axis, cell[below]] = False
@@ -276,8 +290,8 @@ def _links(
             for q in range(COPIES):
                 meet = (masks[low, 3 + axis] >> p & 1) & (masks[high, axis] >> q & 1) > 0
                 meet[neither] &= asked[axis, low[neither]]
-                on_low = faces[row[low[meet & both]], 3 + axis] == p
-                on_high = faces[row[high[meet & both]], axis] == q
+                on_low = lines[row[low[meet & both]], 3 + axis] == p
+                on_high = lines[row[high[meet & both]], axis] == q
                 meet[meet & both] = (on_low & on_high).any(axis=1)
                 own = low[meet]
                 meeting.append(np.stack([own, np.full_like(own, p), np.full_like(own, q)]))

@@ -121,13 +121,12 @@ class Lock:
                     raise InputError(f"{path} is being written by another run") from None
                 # the file system has no locks
                 return
-            with suppress(FileNotFoundError):
-                if os.path.samestat(os.fstat(self._file), os.stat(self.path)):
-                    return
+            if is_named(self._file, self.path):
+                return
             # the last holder has removed the name: another run may lock a new file
             os.close(self._file)
 
-    def free(self) -> None:
+    def close(self) -> None:
         """Release the lock and remove its file."""
         unlink_inode(self.path, self.inode)
         os.close(self._file)
@@ -136,6 +135,14 @@ class Lock:
     def inode(self) -> int:
         """Inode number of the lock's file."""
         return os.fstat(self._file).st_ino
+
+
+def is_named(file: int, path: Path) -> bool:
+    """Return whether the path names the open file of a descriptor."""
+    try:
+        return os.path.samestat(os.fstat(file), os.stat(path))
+    except FileNotFoundError:
+        return False
 
 
 def unlink_inode(path: Path, inode: int) -> None:

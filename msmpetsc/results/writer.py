@@ -29,6 +29,7 @@ from msmpetsc.geometry.surface import Surface, joined
 from msmpetsc.results.disk import (
     Lock,
     Storage,
+    is_named,
     plain_errors,
     refuse_existing,
     refuse_small_disk,
@@ -254,7 +255,7 @@ class ResultFile:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with ExitStack() as opened:
             lock = Lock(self.path)
-            opened.callback(lock.free)
+            opened.callback(lock.close)
             opened.callback(self._part.unlink, missing_ok=True)
             if self._begin is Begin.IN_PLACE:
                 open_result(self.path).close()
@@ -279,15 +280,12 @@ class ResultFile:
     def _refuse_lost_name(self) -> None:
         """Raise InputError if the path names no file or another file than is written."""
         # before `start_frames` ends, the file has its temporary name
-        if self._storage is None or not self._numbers:
-            return
-        with suppress(FileNotFoundError):
-            if os.path.samestat(os.fstat(self._storage.fileno()), os.stat(self.path)):
-                return
-        raise InputError(
-            f"{self.path} was deleted, moved or replaced during the run: "
-            "--resume continues a moved file"
-        )
+        storage = self._storage if self._numbers else None
+        if storage and not is_named(storage.fileno(), self.path):
+            raise InputError(
+                f"{self.path} was deleted, moved or replaced during the run: "
+                "--resume continues a moved file"
+            )
 
     def _lay_out(self, file: h5py.File, layout: Layout, kept: int | None) -> None:
         """Create the datasets, or check the existing datasets of a file written in place.

@@ -298,7 +298,7 @@ class EnergyBalance:
         work = 0.0
         # Explicit steps count the work of loads in StepResult.
         if not result.explicit:
-            loads = environment.forces.mean(time - time_step, time, through=True)
+            loads = environment.forces.mean(time - time_step, time, reach=0.5)
             # Damping is a loss, and in a moving frame also the uniform force per mass
             # -alpha times the frame's velocity.
             uniform = environment.damping * lattice.mass[:, None] * drift

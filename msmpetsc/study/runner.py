@@ -5,7 +5,7 @@ import shutil
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import ExitStack, suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from threading import Lock
@@ -169,12 +169,9 @@ def run_study(
         wanted = np.array_split(wanted, part[1])[part[0] - 1].tolist()
         own = part_folder(folder, part)
     own.mkdir(parents=True, exist_ok=True)
-    with ExitStack() as lock:
-        lock.callback(FileLock(own / "table.csv").free)
+    with closing(FileLock(own / "table.csv")):
         if restart:
-            (own / "table.csv").unlink(missing_ok=True)
-            for name in ("runs", "references", PARTS):
-                shutil.rmtree(own / name, ignore_errors=True)
+            _clear(own)
         else:
             _refuse_other_study(own, path.stem, every)
         known = [own] if restart else [own, folder, *sorted((folder / PARTS).glob("*"))]
@@ -243,6 +240,13 @@ def described(row: Row) -> str:
 
 
 # ---- results of earlier runs
+
+
+def _clear(folder: Path) -> None:
+    """Remove the table, the logs and the references of earlier runs from a folder."""
+    (folder / "table.csv").unlink(missing_ok=True)
+    for name in ("runs", "references", PARTS):
+        shutil.rmtree(folder / name, ignore_errors=True)
 
 
 def _continued(folders: Sequence[Path], by_id: dict[str, Case]) -> dict[str, Row]:

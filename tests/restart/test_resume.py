@@ -498,7 +498,7 @@ def take_and_free(path: Path, times: int, twice) -> None:
             os.unlink(path)
         except FileExistsError:
             twice.value += 1
-        lock.free()
+        lock.close()
     os._exit(0)
 
 

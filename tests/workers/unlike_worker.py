@@ -22,6 +22,6 @@ for number, call in enumerate(calls):
         call()
     except InputError as error:
         said = str(error)
-    # one write, so that lines of ranks do not mix
+    # a single write, so that lines of ranks do not mix
     sys.stdout.write(f"{number} {said}\n")
     sys.stdout.flush()

@@ -120,7 +120,7 @@ def _draw_start(subject: Drawable, cells: str, path: Path, style: Style) -> None
 
 
 def _write_start(path: Path, changes: list[str], result: Path) -> str:
-    """Write the start of a scene as a result of one frame; return the number of cells as text.
+    """Write the start of a scene as a result of a single frame; return the number of cells as text.
 
     Raises InputError.
     """

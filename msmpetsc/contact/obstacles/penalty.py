@@ -108,7 +108,7 @@ class Penalty:
         """
         if self.restitution is None:
             return q, q_previous
-        rows, into = striking(self.obstacle, q, q_previous, step)
+        rows, into, out = striking(self.obstacle, q, q_previous, step)
         start = step.time - step.length
         strikes = self.obstacle.depths(q_previous, start, step.sides)[0][rows] < 0
         if strikes.any():
@@ -116,12 +116,9 @@ class Penalty:
             q_previous = q_previous.copy()
             q_previous[rows] += lost * into[strikes]
             if step.explicit:
-                depth, face = self.obstacle.depths(q, step.time, step.sides)
-                normal = self.obstacle.normals_at(q[rows], step.time, face[rows])
-                back = lost * depth[rows, None] * normal
                 q = q.copy()
-                q[rows] += back
-                q_previous[rows] += back
+                q[rows] += lost * out[strikes]
+                q_previous[rows] += lost * out[strikes]
         return q, q_previous
 
 

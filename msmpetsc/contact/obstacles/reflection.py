@@ -49,7 +49,7 @@ class Exchange:
         new v_n has -e times this part. If e = 1 and the obstacle rests, this exchanges the normal
         parts of q_n and q_(n-1).
         """
-        rows, into = striking(self.obstacle, q, q_previous, step)
+        rows, into, _ = striking(self.obstacle, q, q_previous, step)
         if len(rows) == 0:
             return q, q_previous
         q, q_previous = q.copy(), q_previous.copy()
@@ -60,15 +60,16 @@ class Exchange:
 
 def striking(
     obstacle: Obstacle, q: Positions, q_previous: Positions, step: StepTaken
-) -> tuple[Indices, Rows]:
-    """Return the nodes (k,) on or behind a face, and their displacements (k, 3) [m] into the solid.
+) -> tuple[Indices, Rows, Rows]:
+    """Return nodes (k,) on or behind a face, their displacements into the solid, and the ways out.
 
-    The displacement is the normal part, inwards, of the step's displacement relative to the
-    obstacle. If the obstacle does not act, the result is empty.
+    The displacement (k, 3) [m] is the normal part, inwards, of the step's displacement relative to
+    the obstacle. The way out (k, 3) [m] leads to the face. If the obstacle does not act, the result
+    is empty.
     """
     time, path = step.time, obstacle.path
     if not obstacle.acts_at(time):
-        return np.zeros(0, np.int64), np.zeros((0, 3))
+        return np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3))
     inside, face = obstacle.depths(q, time, step.sides)
     behind = inside >= 0
     if step.sides is not None and obstacle.solid.has_sides:
@@ -78,4 +79,5 @@ def striking(
     v = q[rows] - q_previous[rows]
     if path.is_moving:
         v = v - like(v, path.displacement_between(time - step.length, time))
-    return rows, np.minimum((v * normal).sum(axis=1), 0)[:, None] * normal
+    into = np.minimum((v * normal).sum(axis=1), 0)[:, None] * normal
+    return rows, into, inside[rows, None] * normal

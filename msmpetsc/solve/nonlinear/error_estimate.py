@@ -41,7 +41,6 @@ class ErrorEstimate:
     lowest          : lower bound of the eigenvalues of M^(-1) H that the last estimate used
     convexity       : least eigenvalue of M^(-1) H that the step has met, at most 1
     is_accepted     : whether the last solve has shown that the error is acceptable
-    reached         : |r_k| / |F|, in the norm of P^-1, of Newton's last solve
     products        : number of products with H in all estimates so far, multigrid's finest level
                       included
     """
@@ -61,7 +60,6 @@ class ErrorEstimate:
         self.lowest = self.convexity = 1.0
         self.is_accepted = False
         self._acceptable = self._first = 0.0
-        self.reached = 1.0
         # Least eigenvalue of P^(-1) H that the step has met, at most 1; 0 with contact
         self._least = 1.0
         self.ksp = PETSc.KSP().create(functional.comm)
@@ -118,8 +116,7 @@ class ErrorEstimate:
             return reasons.DIVERGED_NANORINF
         if its == 0:
             self._first = residual
-        self.reached = residual / self._first if self._first > 0 else 1.0
-        if its > 0 and self._acceptable > 0 and self._accepts_met(ksp, residual):
+        elif self._acceptable > 0 and self._accepts_met(ksp, residual):
             return reasons.CONVERGED_HAPPY_BREAKDOWN
         if residual <= atol:
             return reasons.CONVERGED_ATOL
@@ -128,6 +125,10 @@ class ErrorEstimate:
                 self._meet_eigenvalues(ksp)
             return reasons.CONVERGED_RTOL
         return reasons.DIVERGED_DTOL if residual >= divtol * self._first else reasons.ITERATING
+
+    def reached(self, ksp: PETSc.KSP) -> float:
+        """Return |r_k| / |F|, in the norm of P^-1, of Newton's last solve."""
+        return ksp.getResidualNorm() / self._first if self._first > 0 else 1.0
 
     def _test_alone(self, ksp: PETSc.KSP, its: int, residual: float) -> PETSc.KSP.ConvergedReason:
         """Return KSP's reason to end a solve for the estimate alone, or to go on."""

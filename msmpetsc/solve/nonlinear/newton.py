@@ -199,7 +199,7 @@ class Newton(StepMethod):
         self.ksp.setOperators(self.jacobian.operator)
         self.control.estimate.begin(outcome.goal * outcome.distance if tells_error else 0.0)
         self.ksp.solve(now.f, self.y)
-        reached = self.control.estimate.reached if self.is_tested else rtol
+        reached = self.control.estimate.reached(self.ksp) if self.is_tested else rtol
         self.jacobian.preconditioner.learn(self.ksp.its, reached)
         if self.ksp.reason == KSP.DIVERGED_INDEFINITE_MAT:
             return replace(outcome, alarm=Alarm.HERE, corrected=False)

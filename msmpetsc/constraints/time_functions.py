@@ -40,14 +40,20 @@ class Lines:
         if len(self.times) == 1:
             constant: Floats = self.vectors[0].copy()
             return constant
-        return np.array([np.interp(time, self.times, column) for column in self.vectors.T])
+        # np.interp copies its columns, so it gets the two rows around the time only
+        last = max(int(self.times.searchsorted(time)), 1)
+        near = slice(last - 1, last + 1)
+        columns = self.vectors[near].T
+        return np.array([np.interp(time, self.times[near], column) for column in columns])
 
     def mean(self, begin: float, end: float, start: float, stop: float | None) -> Floats:
         """Return the mean (c,) from begin to end [s].
 
         The function counts as 0 before ``start`` [s] and after ``stop`` [s]; None is infinite.
         """
-        inner, stop = self.times.tolist(), np.inf if stop is None else stop
+        before, after = self.times.searchsorted([begin, end])
+        inner = self.times[max(before - 1, 0) : after + 1].tolist()
+        stop = np.inf if stop is None else stop
         for kink in (start, *inner, stop):
             begin, end = (
                 kink if abs(kink - time) <= AT_EVENT * abs(time) else time for time in (begin, end)

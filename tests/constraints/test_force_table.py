@@ -1,12 +1,14 @@
 """Forces that change with time by a table, `total = { times, values }`, linear in between."""
 
 from pathlib import Path
+from time import process_time
 
 import numpy as np
 import pytest
 from block_scene import block_scene, play
 from one_process import input_error
 
+from msmpetsc.constraints.time_functions import Lines
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError
 from msmpetsc.scene.reading import load_scene
@@ -47,6 +49,18 @@ def test_its_times_are_events_for_adaptive_steps_and_statics(tmp_path: Path):
     assert set(TABLE["times"]) <= set(environment.events())
     assert environment.is_same(0, STEP) and environment.is_same(8 * STEP, 9 * STEP)
     assert not environment.is_same(3 * STEP, 4 * STEP)
+
+
+def test_a_step_takes_no_longer_if_other_rows_of_the_table_are_many():
+    def seconds(rows: int) -> float:
+        times = np.linspace(0, rows / 1000, rows + 1)
+        table = Lines(times, np.column_stack([times] * 3))
+        begun = process_time()
+        assert table.mean(0, 1, 0.0, None) == pytest.approx([0.5] * 3)
+        return process_time() - begun
+
+    few, many = (min(seconds(rows) for _ in range(3)) for rows in (1000, 200_000))
+    assert many < 6 * few
 
 
 WRONG = {

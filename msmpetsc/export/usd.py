@@ -4,6 +4,7 @@
 shade each triangle flat.
 """
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -47,12 +48,14 @@ def write_usd(run: Result, frames: Sequence[int], path: Path) -> None:
             UsdBody(stage, root.GetPath(), triangles, of_point, number)
             for number in np.unique(of_point)
         ]
-        for frame, code in zip(frames, codes, strict=True):
+        # each save of a binary file writes the times of all samples again
+        unsaved = math.isqrt(len(frames))
+        for number, (frame, code) in enumerate(zip(frames, codes, strict=True)):
             points = run.surface_at(frame) - middle
             for body in bodies:
                 body.add(points, float(code))
-            # a binary file grows frame by frame, a text is written at the end
-            if path.suffix != ".usda":
+            # a text is written at the end
+            if path.suffix != ".usda" and number % unsaved == 0:
                 stage.Save()
         stage.Save()
     except Tf.ErrorException as error:

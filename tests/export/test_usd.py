@@ -55,6 +55,14 @@ def test_points_are_those_of_the_result_at_every_time(
     assert lengths == pytest.approx(1, abs=1e-6)
 
 
+def test_saves_do_not_fill_a_binary_file_of_many_frames(tmp_path: Path):
+    frames = [small_result.frame(k, surface=surface(0)) for k in range(1000)]
+    result = small_result.write(tmp_path / "x.h5", frames)
+    path = export(result, tmp_path / "y.usdc")
+    # 16 MB if it is saved at each frame
+    assert path.stat().st_size < 1e6
+
+
 def test_points_far_from_the_origin_are_exact(tmp_path: Path):
     result = small_result.write(tmp_path / "x.h5", far_frames())
     _stage, (mesh,) = opened(export(result, tmp_path / "y.usdc"))

@@ -315,9 +315,12 @@ class ResultFile:
                 if dataset.shape[1:] != shape[1:]:
                     raise InputError(f"{self.path} is damaged: frames/{name} has shape {shape}")
             count = len(earlier.frames.time[:kept])
-            for index in range(count):
-                for name, dataset in datasets.items():
-                    dataset[index] = earlier.frames[name][index]
+            for name, dataset in datasets.items():
+                # fields of nodes or points may be too large for the memory
+                step = 1 if is_distributed(name) else max(count, 1)
+                for first in range(0, count, step):
+                    rows = slice(first, first + step)
+                    dataset[rows] = earlier.frames[name][rows]
         self.finished = count
 
     def _finish(self) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import small_result
 from conftest import WORKERS, run
 from frames_worker import NODES, POINTS, STEPS, frame, positions
 from mpi4py import MPI
@@ -135,6 +136,28 @@ def test_going_on_writes_nothing_but_numbers_in_their_places(tmp_path, monkeypat
             step, q, _ = newest_checkpoint(killed)
             assert step in (finished(killed) - 1, finished(killed) - 2)
             assert np.array_equal(q, positions(step, NODES))
+
+
+def test_a_copy_of_frames_writes_their_numbers_together(tmp_path, monkeypatch):
+    frames = [small_result.frame(index) for index in range(9)]
+    path, sizes = tmp_path / "x.h5", (len(small_result.NODES), {"surface": len(frames[0].surface)})
+    writes = []
+    for kept in (4, 8):
+        small_result.write(path, frames)
+        with monkeypatch.context() as patched, h5py.File(path) as whole:
+            disk = Disk()
+            disk.replace_file(patched)
+            with ResultFile(path, MPI.COMM_SELF, {}, Begin.COPY) as file:
+                file.start_frames(12, *sizes, kept=kept)
+            with h5py.File(disk) as copied:
+                assert finished(copied) == kept
+                for name in FRAME_FIELDS.keys() & copied["frames"]:
+                    both = (file["frames"][name][:kept] for file in (copied, whole))
+                    assert np.array_equal(*both, equal_nan=True), name
+        writes.append(len(disk.log))
+        path.unlink()
+    # more frames take more writes for nodes and points alone
+    assert writes[1] - writes[0] == 2 * 4
 
 
 def write_frames(file: ResultFile, indices: range) -> None:

@@ -101,10 +101,12 @@ def write_glb(run: Result, frames: Sequence[int], path: Path) -> None:
     indices = chunk.add(triangles.astype("<u4").ravel(), TRIANGLES)
     shape = chunk.add_shape(base, upright)
     targets = []
+    # the animation has a weight of each target at each frame
+    weights = 4 * len(frames) * len(others)
     for frame in others:
         points = (run.surface_at(frame) - middle).astype(np.float32)
         targets.append(chunk.add_shape(points - base, normals(points, triangles) - upright))
-        if chunk.size > MOST_BYTES:
+        if chunk.size + weights > MOST_BYTES:
             raise InputError(
                 f"{path} would be longer than 4 GiB, the limit of glTF: "
                 "choose fewer frames (--frames)"

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import meshio
@@ -17,7 +18,7 @@ from vtk.util.numpy_support import vtk_to_numpy
 
 import msmpetsc
 from msmpetsc.errors import InputError
-from msmpetsc.export.formats import export, normals
+from msmpetsc.export.formats import export, normals, write_glb
 from msmpetsc.fields import Frame
 from msmpetsc.results.xdmf import write_xdmf
 
@@ -96,6 +97,15 @@ def test_gltf_keeps_to_its_rules(bar_result: Path, tmp_path: Path):
     data = export(bar_result, tmp_path / "one.glb", frames=[2]).read_bytes()
     one = json.loads(data[20:].split(b"BIN\0")[0][:-4])
     assert "animations" not in one and "targets" not in one["meshes"][0]["primitives"][0]
+
+
+def test_more_frames_than_a_gltf_can_hold_are_refused_at_once(tmp_path: Path):
+    count = 40_000
+    run = SimpleNamespace(path=tmp_path / "x.h5", frames=SimpleNamespace(time=np.arange(count)))
+    run.indices, run.surface_at = lambda _: np.array([[0, 1, 2]]), lambda _: POINTS
+    path = tmp_path / "x.glb"
+    assert "4 GiB" in input_error(lambda: write_glb(run, range(count), path))
+    assert not path.exists()
 
 
 def test_normals_are_those_of_a_ball():

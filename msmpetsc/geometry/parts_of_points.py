@@ -37,9 +37,11 @@ class PartsOfPoints:
 
         cell = places_of(self.keys, packed(ijk))
         part = np.zeros(len(points), np.int64)
+        order = np.argsort(cell)
+        sorted_cell = cell[order]
         # a cell of a single part has part 0
         for number in np.intersect1d(cell, self.cell[self.part > 0]):
-            own = cell == number
+            own = order[slice(*np.searchsorted(sorted_cell, [number, number + 1]))]
             rows = slice(*np.searchsorted(self.cell, [number, number + 1]))
             triangles = self.surface.triangles[self.triangle[rows]]
             nearest = igl.point_mesh_squared_distance(points[own], self.surface.points, triangles)

@@ -8,7 +8,6 @@ because each row of W sums to 1 and reproduces linear fields.
 from collections.abc import Sequence
 
 import numpy as np
-import trimesh
 from mpi4py import MPI
 from scipy.sparse import csr_array, vstack
 
@@ -17,7 +16,7 @@ from msmpetsc.comm import Route, on_root
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.embedding import embed
 from msmpetsc.geometry.grid import MOST_ON_PLANE
-from msmpetsc.geometry.surface import Surface, compact, first_of_equal
+from msmpetsc.geometry.surface import Surface, compact, first_of_equal, have_three_corners
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.region import Finder, groups_named
 from msmpetsc.scene.motion import Pressure
@@ -100,22 +99,33 @@ def doubled_areas(corners: Rows) -> Rows:
 
 
 def _refined(surface: Surface, longest: float) -> Surface:
-    """Return a surface whose triangles are cut into four until no edge is too long.
+    """Return a surface whose edges are halved until no edge is too long.
 
-    All triangles are cut alike, so that a closed surface stays closed. The new points lie on the
-    surface at rest, so that the lattice also carries the inside of a large triangle.
+    A long edge is halved in all its triangles, so that a closed surface stays closed. The new
+    points lie on the surface at rest, so that the lattice also carries the inside of a triangle.
 
     longest : longest edge [m]
     """
     points, triangles = surface.points, surface.triangles
     while 0 < len(triangles) < MOST_TRIANGLES:
-        ends = np.roll(points[triangles], -1, axis=1)
-        if np.linalg.norm(ends - points[triangles], axis=2).max() <= longest:
-            break
-        points, triangles = trimesh.remesh.subdivide(  # type: ignore[no-untyped-call]
-            points, triangles
+        ends = np.sort([triangles, np.roll(triangles, -1, axis=1)], axis=0)
+        _, first, edge = np.unique(
+            ends[0] * len(points) + ends[1], return_index=True, return_inverse=True
         )
-    return Surface(points, np.asarray(triangles, np.int64))
+        low, high = points[ends.reshape(2, -1)[:, first]]
+        is_long = np.linalg.norm(high - low, axis=1) > longest
+        if not is_long.any():
+            break
+        middle = len(points) + np.cumsum(is_long) - 1
+        points = np.concatenate([points, 0.5 * (low + high)[is_long]])
+        # the first end stands for the middle of a short edge
+        edge = edge.reshape(-1, 3)
+        a, b, c = triangles.T
+        ab, bc, ca = np.where(is_long[edge], middle[edge], triangles).T
+        parts = np.array([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]])
+        triangles = parts.swapaxes(1, 2).reshape(-1, 3)
+        triangles = triangles[have_three_corners(triangles)]
+    return Surface(points, triangles)
 
 
 def _open_edges(surface: Surface) -> Rows:

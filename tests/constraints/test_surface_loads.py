@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from block_scene import EPS, SIDES, block_scene, half_space, model_of, play, roller, solid_of
+from block_scene import CELL, EPS, SIDES, block_scene, half_space, model_of, play, roller, solid_of
 from obj_files import write_obj
 from one_process import command_error
 
@@ -80,6 +80,19 @@ def test_a_closed_pressure_has_the_potential_p_times_volume(tmp_path: Path):
     bound = np.zeros(len(rest))
     law.add_concavity(q, bound)
     assert np.vdot(product, way) + bound @ (way**2).sum(axis=1) > 0
+
+
+def test_only_long_edges_are_halved(tmp_path: Path):
+    """A capsule of 512 triangles, 32 of them long, stays closed; all cut alike would be 131,072."""
+    trimesh.creation.capsule(0.6, 0.2, count=[16, 16]).export(tmp_path / "capsule.ply")
+    model = model_of(pressed_block(tmp_path, mesh={"source": "capsule.ply"}))
+    (part,) = model.lattice.pressed
+    a, b, c = part(model.lattice.nodes)
+    assert np.linalg.norm(part.rest - np.roll(part.rest, 1, axis=0), axis=2).max() <= CELL / 2
+    assert np.abs(np.cross(b - a, c - a).sum(axis=0)).max() < 1e-14
+    volume = trimesh.load(tmp_path / "capsule.ply").volume
+    assert (np.cross(a, b) * c).sum() / 6 == pytest.approx(volume, rel=1e-12)
+    assert len(a) < 8000
 
 
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2", "verlet"])

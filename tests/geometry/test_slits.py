@@ -1,7 +1,6 @@
 """Regions and probes at slits narrower than a cell: those on one prong ignore the other prong."""
 
 from pathlib import Path
-from time import process_time
 
 import numpy as np
 import pytest
@@ -9,10 +8,6 @@ import trimesh
 from block_scene import model_of, play, solid_of, write_scene
 from obj_files import write_obj
 from test_copies import DEPTH, FORCE, LENGTH, WIDTH, YOUNG, H, fork
-
-from msmpetsc.geometry.grid import packed
-from msmpetsc.geometry.parts_of_points import PartsOfPoints
-from msmpetsc.geometry.surface import Surface
 
 # the tip of the upper prong begins here [m]
 BEYOND = (LENGTH - 1.5) * H
@@ -92,19 +87,3 @@ def test_a_pin_of_a_prong_holds_no_node_of_the_other(tmp_path: Path, slit: float
     at_end = np.flatnonzero(model_of(scene).lattice.nodes[:, 0] > (LENGTH - 0.5) * H)
     np.testing.assert_array_equal(np.union1d(*held), at_end)
     assert len(at_end) == (DEPTH + 1) * (WIDTH + (3 if shift != 0.5 else 2))
-
-
-def test_the_time_to_find_parts_of_points_is_linear_in_the_cells():
-    """Each cell of a row has part 1 of a body, a triangle, and ten points."""
-
-    def seconds(cells: int) -> float:
-        ijk = np.arange(cells)[:, None] * [0, 0, 1]
-        corners = (ijk[:, None] + 0.5 * np.eye(3)).reshape(-1, 3)
-        surface, rows = Surface(corners, np.arange(3 * cells).reshape(-1, 3)), np.arange(cells)
-        finder = PartsOfPoints(surface, packed(ijk), rows, rows, np.ones(cells, np.int64))
-        points = np.repeat(ijk, 10, axis=0)
-        begun = process_time()
-        assert (finder.find(points + 0.2, points) == 1).all()
-        return process_time() - begun
-
-    assert seconds(30_000) < 30 * min(seconds(3000) for _ in range(3))

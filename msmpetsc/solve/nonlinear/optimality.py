@@ -26,11 +26,8 @@ CONVEX = 0.5
 SMALL = 0.3
 # Factor on the error if the two corrections disagree [-]
 DOUBTFUL = 30.0
-# Ratio of the slope of g to the change of slope over the first move, below which the
-# slope may be rounding [-]
-SLOPE = 0.25
-# First move off a saddle [cells], doubled while g falls or halved until g falls; and
-# greatest number of moves
+# First move off a saddle [cells], doubled while g falls, or halved and turned round
+# until g falls; and greatest number of moves
 FIRST_MOVE, MOVES = 1e-3, 24
 
 
@@ -41,14 +38,12 @@ class Verdict:
     error      : relative error of the iterate; infinite if no estimate is possible
     examined   : point at which g was examined, x or x - e
     direction  : (n,) direction of negative curvature; None if there is none
-    curvature  : curvature along the direction, an eigenvalue of M^(-1) H
     is_minimum : whether the step may end at the iterate
     """
 
     error: float
     examined: Iterate
     direction: Floats | None = None
-    curvature: float = 1.0
     is_minimum: bool = False
 
 
@@ -87,7 +82,7 @@ class Optimality:
         if value <= CONVEX:
             value, direction = self.curvature.lowest(examined.q, compression, outcome.alarm, hint)
         if value < 0:
-            return Verdict(np.inf, examined, direction, value)
+            return Verdict(np.inf, examined, direction)
         value = min(value, 1.0)
         estimate.convexity = min(estimate.convexity, value)
         rest = functional.dual_norm(examined.f) / value
@@ -157,21 +152,16 @@ class Optimality:
         lower = verdict.examined if falls else None
         if verdict.direction is None:
             return lower
-        return self._descend(lower or at, verdict.direction, verdict.curvature) or lower
+        return self._descend(lower or at, verdict.direction) or lower
 
-    def _descend(self, at: Iterate, direction: Floats, curvature: float) -> Iterate | None:
+    def _descend(self, at: Iterate, direction: Floats) -> Iterate | None:
         """Return an iterate of lower g along a direction (n,) of negative curvature.
 
         Return None if no move lowers g.
         """
         functional = self.functional
-        slope = reduced(functional.comm, float(self.memory.read(at.f) @ direction))
         longest = float(reduced(functional.comm, greatest(np.abs(direction)), MPI.MAX))
         move = FIRST_MOVE * functional.lattice.cell_size / longest
-        # A smaller slope may be rounding. Then g falls in both directions, and all
-        # ranks take the same direction.
-        if slope > SLOPE * abs(curvature) * move:
-            move = -move
         x, best, lowest = functional.vectors.take(), 0.0, 0.0
         for _ in range(MOVES):
             self.memory.write(x)[:] = self.memory.read(at.x) + move * direction
@@ -182,7 +172,7 @@ class Optimality:
                 best, lowest = move, change
                 move *= 2
             elif best == 0.0:
-                move /= 2
+                move /= -2
             else:
                 break
         if best == 0.0:

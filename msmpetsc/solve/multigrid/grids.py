@@ -19,10 +19,6 @@ from msmpetsc.solve.linear.unknowns import Unknowns
 from msmpetsc.solve.multigrid.coarse_copies import CoarseCopies
 from msmpetsc.solve.petsc.library import refuse_unknowns
 
-# greatest number of nodes of a coarse grid [nodes of the finer grid]; a larger grid
-# does not pay
-SHRINK = 0.7
-
 
 @dataclass(frozen=True)
 class CoarseGrid:
@@ -65,7 +61,7 @@ def grids(
 ) -> list[CoarseGrid]:
     """Return the coarse grids of nodes with keys (n,), the finest first (collective).
 
-    Coarsening stops early if the next grid would not be much smaller. Raises InputError if PETSc
+    Coarsening stops early if the next grid would not be smaller. Raises InputError if PETSc
     cannot number the nodes.
 
     free     : (n,) local numbers of the nodes in the lattice
@@ -79,7 +75,7 @@ def grids(
         parents, needed = parents_of(keys, of_parents)
         grid = CoarseGrid(SortedKeys(comm, parents[needed]), of_parents)
         refuse_unknowns(grid.table.total)
-        if levels and grid.table.total > SHRINK * total:
+        if levels and grid.table.total >= total:
             break
         levels.append(grid)
         total, keys = grid.table.total, grid.table.keys

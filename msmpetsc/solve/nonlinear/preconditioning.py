@@ -37,9 +37,6 @@ MASSLESS = 1e9
 USUAL_RATE = 2.5
 # Number of iterations that cost as much as a new hierarchy
 WORTH = 10.0
-# Number of iterations beyond the usual number that a solve with an old hierarchy may
-# take
-PATIENCE = 15.0
 
 
 class StepPreconditioner:
@@ -229,7 +226,7 @@ class LatticePreconditioner(StepPreconditioner):
         # a hierarchy of the present positions, or before its first solve, has no limit
         if self.is_new or self.rate is None:
             return None
-        return int(self.rate * _digits(rtol) + PATIENCE - self.excess)
+        return int(self.rate * _digits(rtol) + WORTH)
 
     def learn(self, its: int, reached: float) -> None:
         """Count the iterations of a linear solve that reduced its residual to ``reached`` [-].

@@ -20,9 +20,6 @@ from msmpetsc.contact.surface.creases import NEAREST
 from msmpetsc.contact.surface.points import SurfacePoints
 from msmpetsc.geometry.surface import Surface
 
-# Number of broad phases whose candidates are kept: of the base of a line search and of
-# its trials
-REMEMBERED = 3
 # Margin of candidate pairs: displacement of a point before a new broad phase [mean
 # edges]; a smaller margin does not give fewer pairs, 0.25 gives four times as many
 REACH = 0.02
@@ -144,8 +141,8 @@ class ContactSearch:
         self.is_narrow = self.is_left_out = False
         # Candidates of a narrow step, on rank 0
         self._around: CandidateSets = ()
-        # The newest first
-        self._known: list[CandidatePairs] = []
+        # Candidates of the last broad phase
+        self._known: CandidatePairs | None = None
 
     def begin_step(self, q: Positions, begin: float, time: float) -> ActivePairs:
         """Begin a step from q between two times [s], with all candidates. Return the pairs at q."""
@@ -165,29 +162,20 @@ class ContactSearch:
     def forget(self) -> None:
         """Forget all positions, so that the next step does not depend on earlier steps."""
         self.widen()
-        self._known, self.start, self.end = [], None, None
+        self._known = self.start = self.end = None
 
     def _valid_at(self, *places: Positions) -> CandidatePairs | None:
-        """Return the newest candidates that are valid at all ``places``, or None.
-
-        places : points (p, 3) [m]
-        """
-        known = enumerate(self._known if self.barrier else ())
-        number: int | None = self.comm.bcast(
-            next((i for i, pairs in known if all(map(pairs.is_valid_at, places))), None)
-        )
-        if number is None:
-            return None
-        self._known.insert(0, self._known.pop(number))
-        return self._known[0]
+        """Return the last candidates if they are valid at all ``places`` (p, 3) [m], or None."""
+        known = self._known
+        is_valid = bool(self.barrier and known and all(map(known.is_valid_at, places)))
+        return known if self.comm.bcast(is_valid) else None
 
     def _broad_phase(self, points: Positions, moved: Rows | None = None) -> CandidatePairs:
         """Find and cache candidate pairs at points (p, 3) [m], or on their paths by ``moved``."""
         margin = REACH * self.edge
         sets = self.barrier.candidates(points, margin, moved) if self.barrier else ()
-        newest = CandidatePairs(margin, points, sets, moved)
-        self._known = [newest, *self._known[: REMEMBERED - 1]]
-        return newest
+        self._known = CandidatePairs(margin, points, sets, moved)
+        return self._known
 
     def find(self, q: Positions, time: float | None = None) -> ActivePairs:
         """Return the pairs that push at positions q.

@@ -307,9 +307,9 @@ class SurfaceContactAt:
         return of_root
 
     @cached_property
-    def projected_hessian(self) -> SurfaceHessian | None:
-        """Projected Hessian with the true Hessian of friction; None if no contact acts."""
-        return self.hessian(True)
+    def true_hessian(self) -> SurfaceHessian | None:
+        """True Hessian; None if no contact acts."""
+        return self._hessian(False, None)
 
     def hessian(self, projected: bool, duals: Rows | None = None) -> SurfaceHessian | None:
         """Return the Hessian; None if no contact acts.
@@ -317,6 +317,10 @@ class SurfaceContactAt:
         projected : project the Hessian of each pair to be positive semidefinite
         duals     : (a, 3) duals of friction; None for the true Hessian of friction
         """
+        is_true = not projected and duals is None
+        return self.true_hessian if is_true else self._hessian(projected, duals)
+
+    def _hessian(self, projected: bool, duals: Rows | None) -> SurfaceHessian | None:
         if not self.presses:
             return None
         whole, touched, points = self._whole_hessian(projected, duals), None, None
@@ -370,11 +374,11 @@ class SurfaceContactAt:
         return csr_array(sum(parts)) if parts else csr_array((pairs.points.size,) * 2)
 
     def bound(self) -> Floats:
-        """Return bounds (owned,) [N/m] of the diagonal blocks of the projected Hessian.
+        """Return bounds (owned,) [N/m] of the diagonal blocks of the true Hessian.
 
         The bounds are rounded up to powers of 4, so that they seldom change.
         """
-        hessian = self.projected_hessian
+        hessian = self.true_hessian
         if hessian is None:
             return np.zeros(self.contacts.owned)
         norms = np.abs(hessian.blocks).reshape(-1, 3, 3).sum(axis=2).max(axis=1)

@@ -207,7 +207,7 @@ class LatticePreconditioner(StepPreconditioner):
         """
         self.is_free, self.is_new = self._is_free(contact), self.is_stale
         if self.is_new:
-            surface = contact.surface.projected_hessian if contact and contact.surface else None
+            surface = contact.surface.hessian(True) if contact and contact.surface else None
             self._build(q.copy(), self._blocks(contact), surface)
         elif contact and not contact.surface:
             return self._follow(self._blocks(contact))

@@ -19,8 +19,10 @@ from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.surface import Surface
 from msmpetsc.solve.integrators.implicit import ContactFaces
+from msmpetsc.solve.nonlinear.curvature import Alarm
 from msmpetsc.solve.nonlinear.error_control import Outcome
 from msmpetsc.solve.nonlinear.functional import StepProblem
+from msmpetsc.solve.nonlinear.newton import Newton
 
 CELL, SIDE, DISTANCE, G = 0.05, 0.2, 1e-3, 9.81
 SOLID = solid_of(1e5)
@@ -170,6 +172,34 @@ def test_a_ball_that_falls_on_a_block_comes_to_rest_on_it(folder: Path):
     height = np.array([mass[ball] @ frame.position[ball, 2] for frame in frames]) / mass[ball].sum()
     # the ball stays above the block, which is hardly dented
     assert height[first:].min() > SIDE and height[-1] > SIDE + 0.8 * SIDE / 2
+
+
+def test_an_iteration_after_negative_curvature_is_projected_with_a_new_hierarchy(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Other rules closed and opened the gap of a pair up to 2,006 times in a step."""
+    events = list[tuple[str, bool, bool]]()
+
+    def linearise(self, now, is_true, projected) -> None:
+        linearised(self, now, is_true, projected)
+        events.append(("system", projected, self.jacobian.preconditioner.is_new))
+
+    def solve(self, now, outcome, tells_error) -> Outcome:
+        result = solved(self, now, outcome, tells_error)
+        is_new = self.jacobian.preconditioner.is_new
+        events.append(("solve", result.alarm is Alarm.HERE, is_new))
+        return result
+
+    linearised, solved = Newton._linearise, Newton._solve
+    monkeypatch.setattr(Newton, "_linearise", linearise)
+    monkeypatch.setattr(Newton, "_solve", solve)
+    tables = {"material": solid_of(1e4), "time": {"step": 0.01, "duration": 0.15}}
+    play(fall(folder, "curved", 0.02, solver={"preset": "newton-multigrid"}, **tables))
+    pairs = [pair for pair in pairwise(events) if pair[0][0] == "solve"]
+    after = [(was_new, then) for (_, met, was_new), then in pairs if met]
+    assert any(not was_new for was_new, _ in after)
+    for was_new, (_, projected, is_new) in after:
+        assert projected and is_new != was_new
 
 
 @pytest.fixture

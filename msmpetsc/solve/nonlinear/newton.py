@@ -5,10 +5,10 @@
     x_(k+1) = x_k - s y              g(x_(k+1)) <= g(x_k) - ALPHA s y . F(x_k)     (Armijo)
 
 until the error of x_k is below the goal (error_control). Under compression H may be indefinite. CG
-then stops with the descent direction found so far. If CG's first direction has a negative
-curvature, no s lowers g. Then the projected Hessian, without negative parts, takes over for some
-iterations. It also takes over if the surface would cross something almost at once along y: this y
-closes gaps whose stiffness CG has not met yet.
+then stops with the descent direction found so far. The next iteration takes the projected Hessian,
+without negative parts, and a new preconditioner. Otherwise iterations might close and open a gap
+between surfaces again and again. If CG's first direction has a negative curvature, no s lowers g,
+and y is computed again with the projected Hessian.
 """
 
 from dataclasses import dataclass, replace
@@ -38,9 +38,6 @@ LEAST, MOST = 0.1, 0.5
 SHORTEST = 1e-6
 # Share of the slope that a direction must keep if bent at obstacles [-]
 DOWNHILL = 0.1
-# Collision-free step length [-] along a direction, below which the next iteration takes
-# the projected Hessian
-STUCK = 0.01
 # Options of PETSc's own convergence test of a linear solve
 TESTS = (
     "ksp_convergence_test",
@@ -119,7 +116,7 @@ class Newton(StepMethod):
             if outcome.is_converged:
                 reason = REASON.CONVERGED_SNORM_RELATIVE
                 break
-            share = self._limit(now)
+            self._limit(now)
             lower = self._search(now, outcome.is_flat)
             if lower is None and projected:
                 reason = REASON.DIVERGED_LINE_SEARCH
@@ -130,7 +127,7 @@ class Newton(StepMethod):
             if its == 0:
                 self.control.missed = self._missed(lower.f, outcome)
             its += 1
-            projected = share < STUCK or its < self.preset.projected
+            projected = outcome.alarm is Alarm.HERE or its < self.preset.projected
             now, outcome = lower, self._judge(lower, outcome, projected)
         self.iterations += its
         self._given = now, outcome
@@ -199,10 +196,11 @@ class Newton(StepMethod):
         self.ksp.setOperators(self.jacobian.operator)
         self.control.estimate.begin(outcome.goal * outcome.distance if tells_error else 0.0)
         self.ksp.solve(now.f, self.y)
+        if self.ksp.reason == KSP.DIVERGED_INDEFINITE_MAT:
+            self.jacobian.preconditioner.renew()
+            return replace(outcome, alarm=Alarm.HERE, corrected=False)
         reached = self.control.estimate.reached(self.ksp) if self.is_tested else rtol
         self.jacobian.preconditioner.learn(self.ksp.its, reached)
-        if self.ksp.reason == KSP.DIVERGED_INDEFINITE_MAT:
-            return replace(outcome, alarm=Alarm.HERE, corrected=False)
         if self.control.estimate.is_accepted:
             return self.control.measured(now, outcome, self._trust(now, outcome))
         return replace(outcome, corrected=tells_error and self.ksp.reason > 0)
@@ -259,20 +257,16 @@ class Newton(StepMethod):
         self.functional.vectors.give_back(x)
         return None
 
-    def _limit(self, now: Iterate) -> float:
-        """Bend y at obstacles, then shorten y so that the surface crosses nothing.
-
-        Return the collision-free step length along the bent y.
-        """
+    def _limit(self, now: Iterate) -> None:
+        """Bend y at obstacles, then shorten y so that the surface crosses nothing."""
         if now.contact is None:
-            return 1.0
+            return
         self.end.waxpy(-1.0, self.y, now.x)
         with LOCAL:
             end = self._stop_at_obstacles(now, now.contact, self.functional.positions(self.end))
             share = self.functional.collision_free_step(now.q, end)
         if share < 1.0:
             self.y.scale(share)
-        return share
 
     def _stop_at_obstacles(self, now: Iterate, contact: StepContactAt, end: Positions) -> Positions:
         """Bend y so that nodes stop at obstacles that they would enter.

@@ -71,6 +71,9 @@ class StepPreconditioner:
     def learn(self, its: int, reached: float) -> None:
         """Count the iterations of a linear solve that reduced its residual to ``reached`` [-]."""
 
+    def renew(self) -> None:
+        """Let the next ``prepare`` build a new preconditioner, unless this one is new."""
+
     def forget(self) -> None:
         """Forget data of earlier steps."""
 
@@ -241,6 +244,9 @@ class LatticePreconditioner(StepPreconditioner):
             self.rate = its / digits
         self.excess += max(its - self.rate * digits, 0.0)
         self.is_stale |= self.excess > WORTH
+
+    def renew(self) -> None:
+        self.is_stale |= not self.is_new
 
     def _build(self, q: Positions, contact: Rows, surface: SurfaceHessian | None) -> None:
         with HIERARCHY:

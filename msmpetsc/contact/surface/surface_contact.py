@@ -354,19 +354,20 @@ class SurfaceContactAt:
 
         Raises StepFailed if the Hessian is not finite.
         """
-        barrier, pairs, parts = self.contacts.barrier, self.pairs, []
+        barrier, pairs = self.contacts.barrier, self.pairs
         with together(self.step.comm):
-            if barrier:
-                try:
-                    parts = barrier.hessian(pairs.sets, pairs.points, projected)
-                # ipctk cannot project a pair's Hessian that is not finite
-                except RuntimeError as error:
-                    meet = self.contacts.in_words(pairs)
-                    raise StepFailed(
-                        f"has contact forces that are not finite: {meet}; "
-                        "try a smaller time.step, or paths that leave the body more room",
-                        "contact",
-                    ) from error
+            try:
+                parts = barrier.hessian(pairs.sets, pairs.points, projected) if barrier else []
+                is_finite = all(np.isfinite(part.data).all() for part in parts)
+            # ipctk cannot project a pair's Hessian that is not finite
+            except RuntimeError:
+                is_finite = False
+            if not is_finite:
+                raise StepFailed(
+                    f"has contact forces that are not finite: {self.contacts.in_words(pairs)}; "
+                    "try a smaller time.step, or paths that leave the body more room",
+                    "contact",
+                )
         if barrier is None:
             return None
         if self.step.friction:

@@ -63,9 +63,9 @@ class Lines:
             return np.zeros(self.vectors.shape[1])
         times = [first, *(time for time in inner if first < time < last), last]
         mean = np.zeros(self.vectors.shape[1])
-        for begun, ended in pairwise(times):
+        for (begun, value), (ended, next_value) in pairwise((t, self.value_at(t)) for t in times):
             share = (ended - begun) / (end - begin)
-            mean += 0.5 * share * (self.value_at(begun) + self.value_at(ended))
+            mean += 0.5 * share * (value + next_value)
         return mean
 
 

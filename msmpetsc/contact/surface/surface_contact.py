@@ -307,7 +307,7 @@ class SurfaceContactAt:
         return of_root
 
     @cached_property
-    def true_hessian(self) -> SurfaceHessian | None:
+    def _true_hessian(self) -> SurfaceHessian | None:
         """True Hessian; None if no contact acts."""
         return self._hessian(False, None)
 
@@ -318,7 +318,7 @@ class SurfaceContactAt:
         duals     : (a, 3) duals of friction; None for the true Hessian of friction
         """
         is_true = not projected and duals is None
-        return self.true_hessian if is_true else self._hessian(projected, duals)
+        return self._true_hessian if is_true else self._hessian(projected, duals)
 
     def _hessian(self, projected: bool, duals: Rows | None) -> SurfaceHessian | None:
         if not self.presses:
@@ -379,7 +379,7 @@ class SurfaceContactAt:
 
         The bounds are rounded up to powers of 4, so that they seldom change.
         """
-        hessian = self.true_hessian
+        hessian = self.hessian(False)
         if hessian is None:
             return np.zeros(self.contacts.owned)
         norms = np.abs(hessian.blocks).reshape(-1, 3, 3).sum(axis=2).max(axis=1)

@@ -66,7 +66,8 @@ def warn_of_long_steps(scene: Scene, model: Model) -> None:
     """Warn if the time step exceeds the longest vibration period of all bodies.
 
     Implicit steps of that length damp the vibration away. The period of a body is estimated as the
-    period of a bending bar with the body's longest and shortest side, mostly an upper estimate.
+    period of a bending bar with the body's longest and shortest side, mostly an upper estimate. A
+    body whose retardation time is longer does not vibrate: it creeps, in the retardation time.
     """
     time = scene.time
     if time.integrator not in ("implicit-euler", "bdf2") or time.error is not None:
@@ -78,7 +79,7 @@ def warn_of_long_steps(scene: Scene, model: Model) -> None:
         bending_period(sides.max(), sides.min(), softest, scene.material.density)
         for sides in lengths
     )
-    if time.step > period > 0:
+    if time.step > max(period, scene.material.retardation_time) and period > 0:
         log.warning(
             "time.step is %.2g periods of the slowest vibration, about %.1g s, which it damps "
             'away: time.step = %.1g resolves it, time.integrator = "static" goes to rest at once',

@@ -200,7 +200,8 @@ def sweep_cases(study: Study, scene: StudyScene, sweep: Sweep, folder: Path) -> 
     file = folder / scene.file
     changes = (*scene.set, *sweep.set)
     as_given = load_scene(file, changes, by_user=False)
-    for cells, integrator in product(sweep.cells or (None,), sweep.integrators):
+    integrators = sweep.integrators or (as_given.time.integrator,)
+    for cells, integrator in product(sweep.cells or (None,), integrators):
         base = Case(
             scene=scene.name, file=file, content=digest(file, as_given), integrator=integrator,
             set=(*changes, *((f"cages.count={cells}",) if cells else ())), cells=cells,

@@ -139,7 +139,7 @@ class Sweep(Table):
     """
 
     scenes: ListOf[str] = ()
-    integrators: ListOf[IntegratorName] = ("implicit-euler",)
+    integrators: ListOf[IntegratorName] = ()
     presets: ListOf[PresetName] = ()
     options: ListOf[Options] = ("",)
     laws: ListOf[Name] = ()
@@ -156,8 +156,8 @@ class Sweep(Table):
 
     @model_validator(mode="after")
     def _has_cases(self) -> "Sweep":
-        if not (self.integrators and self.options and self.ranks):
-            raise rule("has no cases: integrators, options and ranks must not be empty")
+        if not (self.options and self.ranks):
+            raise rule("has no cases: options and ranks must not be empty")
         return self
 
 

@@ -77,6 +77,14 @@ def test_a_sweep_is_a_product(tmp_path: Path):
     assert 'step = 0.02, duration = 0.1, integrator = "implicit-euler"' in last
 
 
+@pytest.mark.parametrize("integrator", ["static", "bdf2"])
+def test_a_sweep_without_integrators_takes_that_of_the_scene(tmp_path: Path, integrator: str):
+    scene = f'{ONE_SCENE}set = ["time.integrator={integrator}"]\n'
+    (found,) = all_cases(tmp_path, scene + "[[sweep]]")
+    assert found.integrator == integrator
+    assert f'integrator = "{integrator}"' in shown_command(found)
+
+
 def test_what_has_no_meaning_for_verlet_is_not_multiplied(tmp_path: Path):
     sweep = '[[sweep]]\nintegrators = ["verlet", "implicit-euler"]\nsubsteps = [1e-4, 1e-5]\n'
     sweep += 'presets = ["newton", "anderson"]'

@@ -340,8 +340,8 @@ COMMANDS = {
             JSON,
         ),
         description="Run the first steps of scenes, each solved to 1e-9, and compare counts, "
-        "energies, momentum and positions with the numbers that --update has stored. Exit status "
-        "0: all agree; 1: a number differs.",
+        "energies, momentum and positions with the numbers that --update has stored. --cells, "
+        "--frames and --set are for --update alone. Exit status 0: all agree; 1: a number differs.",
         starts_runs=True,
     ),
     "fetch": Command(

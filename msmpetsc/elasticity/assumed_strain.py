@@ -30,9 +30,9 @@ that are about to fold.
 
 - W is a sum of squares: it is never negative, also in folded cells, and 0 for rigid motions.
 - The quartic term is convex, and its Hessian at rest is 0. The projected Hessian leaves it out.
-- At rest W is at most mu V <|G|^2> (1 + 3 beta / 2) if d_x, d_y and d_z are not correlated. The
+- Near rest W is at most mu V <|G|^2> (1 + 3 beta / 2) if d_x, d_y and d_z are not correlated. The
   general bound is in lattice.cell_moments.bounding_laplacians.
-- Q depends on C alone. K is its quadratic form in the nine a (3 axes, 3 modes).
+- Q is a quadratic form K in the nine a (3 axes, 3 modes), which depends on C and beta alone.
 
 With r_I = sum over m of (K a)_I,m p_m, the gradient of Q / 2 has the parts
 

@@ -72,7 +72,7 @@ def springs_of(lattice: Lattice, first: int | None = None) -> Springs:
 def crushing_energy(lattice: Lattice) -> float:
     """Return the energy [J] that compresses every spring of this rank to zero length.
 
-    For a solid, return the energy by the form of L that compresses every cell to a point.
+    For a solid, return the energy of the quadratic form L as every cell is compressed to a point.
     """
     if lattice.solid:
         return float(1.5 * lattice.solid.bounds[: lattice.cells_owned].sum())

@@ -85,10 +85,10 @@ class Finder:
         return where
 
     def _at_edge(self, table: OfBody, lattice: Lattice, outside: Mask) -> Mask:
-        """Return the mask (l,) of nodes in ``outside`` (l,) with the body in the region nearby.
+        """Return the mask (l,) of nodes in ``outside`` (l,) near material in the region.
 
-        The body's points nearest to the six places half a cell away from the node, along the grid's
-        axes, decide (collective).
+        From a node, six places lie half a cell away along the grid's axes. The region must contain
+        the body's point nearest to one of these places (collective).
         """
         rows = np.flatnonzero(outside)
         sides = np.concatenate([np.eye(3), -np.eye(3)])

@@ -361,8 +361,8 @@ class Adaptive(Integrator):
             mass @ (local**2).sum(axis=1),
             mass @ ((x - self.lattice.nodes[owned]) ** 2).sum(axis=1),
         ]
-        # At rest, the size of the motion is the displacement until the next frame.
-        # The start shows the size of the motion of displaced nodes.
+        # The size of the motion is the distance from rest. For nodes at rest, it is the
+        # displacement until the next frame.
         is_at_rest = (before.q[owned] == self.lattice.nodes[owned]).all(axis=1)[:, None]
         coming = is_at_rest * (self.time_step * w + 0.5 * self.time_step**2 / t * (w - v))
         # An impact or a change of contact force may come at any time within the step.

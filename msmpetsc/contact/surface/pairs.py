@@ -153,9 +153,9 @@ class ContactSearch:
 
     def pairs_at(self, q: Positions, time: float) -> ActivePairs:
         """Return the pairs at q and a time [s], known if the last step began or ended there."""
-        for known in (self.end, self.start):
-            is_known = known is not None and known.q is q and self.same(known.time, time)
-            if known and reduced(self.comm, is_known, MPI.LAND):
+        for known in filter(None, (self.end, self.start)):
+            is_known = known.q is q and not self.obstacles.moves(known.time, time)
+            if reduced(self.comm, is_known, MPI.LAND):
                 return known
         return self.find(q, time)
 
@@ -224,10 +224,6 @@ class ContactSearch:
         self.end = self.find(x)
         missing = abs(self.summary(self.end).energy - energy)
         return free and missing <= SAME_ENERGY * energy + LEFT_OUT * tolerance, free
-
-    def same(self, begin: float, end: float) -> bool:
-        """Return whether obstacles have the same places at two times [s]."""
-        return not self.obstacles.moves(begin, end)
 
     def pushes(self, pairs: ActivePairs) -> Rows:
         """Return the gradient (total, 3) [N] of the barrier on rank 0; (0, 3) elsewhere."""

@@ -66,7 +66,7 @@ class CarriedStart:
         if share == 1.0:
             return guess
         end, obstacles, moved = contacts.time, contacts.obstacles, guess - problem.q
-        if problem.prescribed is None and contacts.same(contacts.begin, end):
+        if problem.prescribed is None and not obstacles.moves(contacts.begin, end):
             still = 0.0 if obstacles.total else drift(moved)
             return problem.q + share * moved + (1 - share) * still
         for displacement in (moved, 0 * moved):

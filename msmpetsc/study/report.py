@@ -27,11 +27,14 @@ FIRST = ["scene", "label", "status"]
 ABOVE = ["study", "machine", "versions"]
 # columns of the table of failed cases
 FAILURE_COLUMNS = ["scene", "label", "time_step", "error", "status", "reason", "command"]
+# number of scenes with charts of their own; a chart takes about a second
+MOST_SCENES = 40
 
 
-def write_report(folder: Path) -> Path:
+def write_report(folder: Path, most_scenes: int = MOST_SCENES) -> Path:
     """Write report.html and its charts as PNG files from a folder's table.csv; return its path.
 
+    Only the first ``most_scenes`` scenes have charts of their own.
     Raises InputError if the table is missing or not readable.
     """
     table = read_table(folder)
@@ -39,23 +42,30 @@ def write_report(folder: Path) -> Path:
     study = tomllib.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
     styles = curve_styles(table["label"])
     sweeps = swept(table)
+    scenes = sweeps["scene"].unique()
+    drawn = sweeps[sweeps["scene"].isin(scenes[:most_scenes])]
     charts = [
         *stability_charts(table, study),
-        *size_charts(sweeps, styles),
-        *pareto_charts(sweeps, styles),
+        *size_charts(drawn, styles),
+        *pareto_charts(drawn, styles),
         *profile_charts(sweeps, styles),
-        *growth_charts(sweeps),
+        *growth_charts(drawn),
     ]
     for chart in charts:
         save_png(chart, folder)
     title = str(study.get("title") or folder.resolve().name)
     written = datetime.fromtimestamp((folder / "table.csv").stat().st_mtime).astimezone()
-    write_whole(folder / "report.html", page(title, f"{written:%d %B %Y, %H:%M %z}", table, charts))
+    left_out = list(scenes[most_scenes:])
+    date = f"{written:%d %B %Y, %H:%M %z}"
+    write_whole(folder / "report.html", page(title, date, table, charts, left_out))
     return folder / "report.html"
 
 
-def page(title: str, date: str, table: DataFrame, charts: list[Chart]) -> str:
-    """Return the report as a self-contained HTML page."""
+def page(title: str, date: str, table: DataFrame, charts: list[Chart], left_out: list[str]) -> str:
+    """Return the report as a self-contained HTML page.
+
+    left_out : names of the scenes without charts
+    """
     environment = Environment(
         autoescape=True, loader=PackageLoader("msmpetsc.study", "."), keep_trailing_newline=True
     )
@@ -67,7 +77,8 @@ def page(title: str, date: str, table: DataFrame, charts: list[Chart]) -> str:
         "failures": failed(swept(table))[FAILURE_COLUMNS],
     }
     template = environment.get_template("report.html.j2")
-    return template.render(title=title, date=date, charts=charts, **facts(table), **tables)
+    shown = {"charts": charts, "left_out": left_out}
+    return template.render(title=title, date=date, **shown, **facts(table), **tables)
 
 
 def facts(table: DataFrame) -> dict[str, Any]:

@@ -243,6 +243,13 @@ def test_surface_errors_are_drawn_over_cost_a_curve_a_way_to_step(tmp_path: Path
     assert [value["y"] for value in rings["data"]["values"]] == [0.2, 0.05, 0.01]
 
 
+def test_only_the_first_scenes_have_charts_of_their_own(tmp_path: Path):
+    rows = [row_of("a", scene=name, true_error=1e-3, time_frame=0.1) for name in "xyz"]
+    text = write_report(write_rows(tmp_path, rows), most_scenes=1).read_text()
+    assert [path.name for path in tmp_path.glob("*.png")] == ["pareto_x_1000.png"]
+    assert "none for the last 2 scenes, from y on" in text
+
+
 # Performance profiles
 
 # seconds of each method on five problems; None for a failure

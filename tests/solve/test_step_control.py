@@ -72,7 +72,7 @@ def test_steps_start_at_multiples_of_themselves_and_end_at_events_and_at_the_end
     assert ticks.fitting(0, 6) == 1
     assert ticks.fitting(2 * 16, 1) == 0
     assert ticks.fitting(3 * 16 + 1, 6) == -4
-    assert 3 * 16 in ticks.events and 3 * 16 + 1 not in ticks.events
+    assert ticks.is_event(3 * 16) and not ticks.is_event(3 * 16 + 1)
     tick, ends = 0, []
     while tick < ticks.ticks:
         level = ticks.fitting(tick, 6)
@@ -80,3 +80,20 @@ def test_steps_start_at_multiples_of_themselves_and_end_at_events_and_at_the_end
         tick += ticks.length(level)
         ends.append(tick)
     assert {3 * 16, round(0.0556 / STEP * 16)} <= set(ends) and ends[-1] == 10 * 16
+
+
+def test_a_step_looks_at_few_of_many_events():
+    looks = []
+
+    class Watched(list[int]):
+        def __getitem__(self, index):
+            looks.append(index)
+            return super().__getitem__(index)
+
+        def __iter__(self):
+            return (self[index] for index in range(len(self)))
+
+    ticks = Ticks(STEP, 10_000, 0, [STEP * number for number in range(10_000)])
+    ticks.events = Watched(ticks.events)
+    assert ticks.fitting(9000, 6) == 0 and ticks.is_event(9000)
+    assert 0 < len(looks) < 100

@@ -19,6 +19,7 @@ All methods are collective.
 
 import math
 import sys
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -175,7 +176,8 @@ class Ticks:
     A step of a level starts at a multiple of its own length, so that no frame lies in two steps. No
     step crosses an event or the end of the run.
 
-    events : ticks of the events, rounded to a step ``NEAREST`` levels below the scene's step
+    events : ticks of the events in order, rounded to a step ``NEAREST`` levels below the scene's
+             step
     ticks  : number of ticks of the run
     """
 
@@ -195,9 +197,14 @@ class Ticks:
         """Return the time [s] of a tick."""
         return tick / 2.0**-self.lowest * self.step
 
+    def is_event(self, tick: int) -> bool:
+        """Return whether a tick is an event."""
+        return bisect_left(self.events, tick) < bisect_right(self.events, tick)
+
     def fitting(self, tick: int, level: int) -> int:
         """Return the highest level, at most ``level``, of a step that may start at a tick."""
-        limit = next((event for event in self.events if event > tick), self.ticks)
+        after = bisect_right(self.events, tick)
+        limit = self.events[after] if after < len(self.events) else self.ticks
         while level > self.lowest and (
             tick % self.length(level) or tick + self.length(level) > limit
         ):
@@ -305,7 +312,7 @@ class Adaptive(Integrator):
 
     def _step(self, state: State) -> tuple[StepResult, State]:
         """Take the next step; repeat it shorter if its error is too large. Raises StepFailed."""
-        restarts = self.tick in self.ticks.events
+        restarts = self.ticks.is_event(self.tick)
         cost, self.coming = Work(), math.inf
         while True:
             longest = self.control.level
@@ -346,7 +353,7 @@ class Adaptive(Integrator):
 
     def _end_time(self, tick: int) -> float:
         """Return the end time [s] of a step that ends at a tick; just before it for an event."""
-        return self.ticks.time(tick) * (JUST_BEFORE if tick in self.ticks.events else 1.0)
+        return self.ticks.time(tick) * (JUST_BEFORE if self.ticks.is_event(tick) else 1.0)
 
     def _measure(self, before: State, result: StepResult, after: State, level: int) -> Measure:
         """Return the local error of a step and the size of the motion up to its end."""

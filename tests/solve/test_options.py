@@ -104,6 +104,12 @@ def test_an_options_file_is_a_file(words: list[str]):
         _check_words(words)
 
 
+def test_the_file_of_a_view_lies_in_a_folder(tmp_path: Path):
+    _check_words(["-log_view", f":{tmp_path}/log:ascii_xml,:beside", "-ksp_view", "-log_view"])
+    with pytest.raises(InputError, match=r"-log_view: no folder .*/gone"):
+        _check_words(["-log_view", f":{tmp_path}/log,:{tmp_path}/gone/log"])
+
+
 BEFORE_THE_MESH = {
     "-snes_rtol 1e-3": "solver.error",
     "-options_file gone": "gone",

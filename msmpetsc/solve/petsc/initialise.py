@@ -60,11 +60,16 @@ def initialise(comm: MPI.Comm, words: list[str]) -> None:
 
 
 def _check_words(words: list[str]) -> None:
-    """Raise InputError for options that end the process and for unreadable options files."""
+    """Raise InputError for options that end the process and for files out of reach."""
     words = [*os.environ.get("PETSC_OPTIONS", "").split(), *words, ""]
     for option, name in pairwise(words):
         if option in NOT_HERE:
             raise InputError(f"{option}: {NOT_HERE[option]}")
+        # type:file:format; PETSc opens some files only at the end of the process
+        files = [view.split(":")[1] for view in name.split(",") if ":" in view]
+        for file in files if option.endswith("_view") else ():
+            if not Path(file).parent.is_dir():
+                raise InputError(f"{option}: no folder {printable(str(Path(file).parent))}")
         if option not in FILE_OPTIONS:
             continue
         where = f"{option} {printable(name)}"

@@ -4,9 +4,10 @@ A pin's region ends between nodes. A spring from a free to a fixed node deforms 
 region, on the fraction theta of its length. So its stiffness is multiplied by 1 / theta. If the
 fixed node lies outside the body, as at a clamped face, the factor is 1 / (sigma theta). The spring
 then stands for the fraction sigma of its length (cut_cells). Along a row of cells both factors are
-exact. A clamp oblique to the grid is second-order accurate, like the Poisson equation of Gibou,
-Fedkiw, Cheng and Kang (2002). A solid's cell uses the mean of sigma theta over its pairs of a free
-and a fixed corner. This is too stiff along the clamp, but no strain occurs there.
+exact. A clamp of springs oblique to the grid is second-order accurate, like the Poisson equation of
+Gibou, Fedkiw, Cheng and Kang (2002). A solid's cell uses the mean of sigma theta over its pairs of
+a free and a fixed corner. This is too stiff along the clamp, but no strain occurs there. An oblique
+clamp of a solid is first-order accurate: its place errs by about 0.1 cells.
 
 A pin of single components, a roller, stiffens no spring: it ends at its nodes, because their other
 components are free.

@@ -145,7 +145,7 @@ def _log_copies(copies: Copies) -> None:
         cells = int((copies.keys % COPIES > 0).sum())
         nodes = np.unique(copies.corners)
         log.info(
-            "parts that do not meet in a cell or at a node: %d copies of cells, %d of nodes",
+            "parts of the body that do not meet: %d copies of cells, %d of nodes",
             cells, int((nodes % COPIES > 0).sum()),
         )  # fmt: skip
 

@@ -22,7 +22,6 @@ from msmpetsc.solve.nonlinear.functional import Configuration, StepFunctional
 from msmpetsc.solve.nonlinear.lobpcg import (
     DEPENDENT,
     EFFORT,
-    LONGEST_SEARCH,
     TINY,
     UNIFORM_EFFORT,
     Lobpcg,
@@ -30,8 +29,6 @@ from msmpetsc.solve.nonlinear.lobpcg import (
 )
 from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 
-# Share of the lowest negative curvature from which modes count as equally steep [-]
-ALIKE = 0.9
 # Growth of the compression, or of the mode's curvature, beyond which another mode may
 # be the lowest [-]
 MORE = 2.0
@@ -138,7 +135,7 @@ class LowestCurvature:
             # A body may buckle equally to several sides, and rounding orders these
             # modes. The projection of noise onto the modes does not depend on their
             # order, so any number of ranks takes the same side.
-            down = modes[: int((values <= ALIKE * values[0]).sum())]
+            down = modes[: int((values < 0).sum())]
             noise = self.search.random(1)[0]
             parts = reduced(self.comm, to_host((down * self.functional.mass) @ noise))
             return values[0], like(down, parts / max(np.linalg.norm(parts), TINY)) @ down
@@ -201,11 +198,11 @@ class LowestCurvature:
         # No rigid motion delays a mode, and all modes converge fast
         if rigid is None and is_uniform:
             start = [noise(block - len(known)), *known]
-            return search.lowest(start, block, LONGEST_SEARCH, least)
+            return search.lowest(start, block, least)
         start = [search.without(rigid, noise(block - is_uniform * len(known)))]
-        _, modes = search.lowest(start, block, LONGEST_SEARCH, least, left_out=rigid)
+        _, modes = search.lowest(start, block, least, left_out=rigid)
         start = [modes, *known, *([] if rigid is None else [rigid])]
-        return search.lowest(start, block, LONGEST_SEARCH, least // 2)
+        return search.lowest(start, block, least // 2)
 
     def _rigid_motions(self, q: Positions) -> Rows | None:
         """Return translations and rotations (k, n), k <= 6, of a free body at positions q (l, 3).

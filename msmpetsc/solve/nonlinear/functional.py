@@ -27,8 +27,6 @@ from msmpetsc.solve.petsc.events import CONTACT, ENERGY, GRADIENT
 
 # Rounding of a row of F [terms of the row]; free fall exceeds one eps now and then
 ROUNDINGS = 3 * np.finfo(float).eps
-# Greatest rounding of a single row [usual rounding]
-SINGLE_ROW = 10.0
 # Greatest displacement by rounding that is negligible [body's size]
 NEGLIGIBLE = 1e-6
 # Displacement by a load beyond which no digits of the body's shape are left [body's
@@ -323,7 +321,7 @@ class Rounding:
             known * max(functional.extent, np.finfo(float).tiny)
         )
         squares, count = reduced(self.comm, [float(rows @ rows), rows.size])
-        return bool(squares <= count and reduced(self.comm, greatest(rows), MPI.MAX) <= SINGLE_ROW)
+        return bool(squares <= count)
 
     @property
     def displacement(self) -> float:

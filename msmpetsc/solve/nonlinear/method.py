@@ -21,8 +21,6 @@ from msmpetsc.solve.nonlinear.jacobian import Jacobian
 from msmpetsc.solve.presets import MOST_ITERATIONS, Preset, SolverOptions
 from msmpetsc.solve.work import Work
 
-# Cost of an iteration without its linear solve [iterations of CG]
-ITERATION = 10
 REASON = PETSc.SNES.ConvergedReason
 
 
@@ -73,7 +71,7 @@ class StepMethod(ABC):
         if Stop.agreed(self.functional.comm):
             return int(REASON.DIVERGED_INNER)
         spent = self.spent()
-        if spent.ksp_its + ITERATION * (spent.iterations + its) > MOST_ITERATIONS:
+        if spent.ksp_its + spent.iterations + its > MOST_ITERATIONS:
             return int(REASON.DIVERGED_MAX_IT)
         return int(REASON.ITERATING)
 

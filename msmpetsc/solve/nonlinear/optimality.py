@@ -26,9 +26,6 @@ CONVEX = 0.5
 SMALL = 0.3
 # Factor on the error if the two corrections disagree [-]
 DOUBTFUL = 30.0
-# First move off a saddle [cells], doubled while g falls, or halved and turned round
-# until g falls; and greatest number of moves
-FIRST_MOVE, MOVES = 1e-3, 24
 
 
 @dataclass(frozen=True)
@@ -157,13 +154,14 @@ class Optimality:
     def _descend(self, at: Iterate, direction: Floats) -> Iterate | None:
         """Return an iterate of lower g along a direction (n,) of negative curvature.
 
-        Return None if no move lowers g.
+        The first move is a cell. Moves are doubled while g falls, or halved and turned round until
+        g falls. Return None if no move lowers g.
         """
         functional = self.functional
         longest = float(reduced(functional.comm, greatest(np.abs(direction)), MPI.MAX))
-        move = FIRST_MOVE * functional.lattice.cell_size / longest
+        move = functional.lattice.cell_size / longest
         x, best, lowest = functional.vectors.take(), 0.0, 0.0
-        for _ in range(MOVES):
+        while functional.extent + abs(move) * longest > functional.extent:
             self.memory.write(x)[:] = self.memory.read(at.x) + move * direction
             q = functional.positions(x)
             is_free = functional.collision_free_step(at.q, q) == 1.0

@@ -6,10 +6,12 @@ import ipctk
 import numpy as np
 import pytest
 import trimesh
-from block_scene import GRAVITY, play, solid_of, write_scene
+from block_scene import GRAVITY, model_of, play, solid_of, write_scene
 
 from msmpetsc.contact.surface.barrier import Barrier, BarrierLaw
+from msmpetsc.contact.surface.pairs import ContactSearch
 from msmpetsc.contact.surface.places import CandidateSet
+from msmpetsc.contact.surface.surface_contact import SurfaceContact
 from msmpetsc.geometry.surface import Surface
 
 # cells of a plate's grid along each side of 1 m
@@ -233,3 +235,30 @@ def test_cards_without_friction_stay_where_they_lie(tmp_path: Path):
     way = (frames[-1].position - frames[0].position)[upper].mean(axis=0)
     assert np.linalg.norm(way[:2]) < 5e-5 * 0.03
     assert abs(way[2]) < 1.9e-4
+
+
+def test_the_hessian_over_a_vertex_is_that_of_the_gradient(tmp_path: Path):
+    """Blocks of equal meshes lie vertex over vertex, and the upper block slides.
+
+    The Hessian of pairs of points was seven times that of the gradient.
+    """
+    trimesh.creation.box([0.2, 0.2, 0.2]).subdivide().export(tmp_path / "block.ply")
+    tables = {
+        "body": [{"mesh": {"source": "block.ply", "base": [0, 0, z]}} for z in (0, 0.2005)],
+        "cages": {"cell_size": 0.1},
+        "material": solid_of(1e6),
+        "time": {"step": 0.01, "duration": 0.01},
+        "self_contact": {"distance": 1e-3, "friction": 0.0},
+    }
+    model = model_of(write_scene(tmp_path, **tables))
+    assert model.collision is not None
+    q, move = model.lattice.nodes, 1e-8
+    search = ContactSearch(model.collision)
+    contact = SurfaceContact(search, search.begin_step(q, 0.0, 0.01), 0.01)
+    slide, product, after, before = (np.zeros_like(q) for _ in range(4))
+    slide[q[:, 2] > 0.2003, 0] = 1.0
+    contact.at(q).hessian(False).add_product(slide, product)
+    contact.at(q + move * slide).add_gradient(after)
+    contact.at(q - move * slide).add_gradient(before)
+    difference = np.vdot(slide, after - before) / (2 * move)
+    assert np.vdot(slide, product) == pytest.approx(difference, rel=0.2)

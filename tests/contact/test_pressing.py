@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from block_scene import DENSITY, GRAVITY, SIDES, G, block_scene, box_at, play, solid_of
+from block_scene import DENSITY, GRAVITY, SIDES, G, block_scene, box_at, play, solid_of, write_scene
 from stopped_runs import assert_goes_on_exactly
 from test_obstacle_surfaces import crossed
 
@@ -67,6 +67,32 @@ def test_a_plate_presses_a_free_block_on_a_floor(tmp_path: Path, way: str):
 
 
 @pytest.mark.slow
+def test_a_tip_over_an_edge_leaves_its_saddle(tmp_path: Path):
+    """Two plates meet a ball whose poles lie over edges of the plates.
+
+    CG met a negative curvature that the search for modes had missed. The step failed, because the
+    search followed its last mode again and again.
+    """
+    ball = trimesh.creation.icosphere(3)
+    ball.apply_translation([0.1, 0, 0]).export(tmp_path / "ball.ply")
+    plates = [
+        box_at([[-2, -2, min(z)], [2, 2, max(z)]], response="barrier")
+        | {"path": [{"time": 0.5, "by": [0, 0, -0.05 * np.sign(z[0])]}]}
+        for z in ([1.002, 1.5], [-1.002, -1.5])
+    ]
+    scene = write_scene(
+        tmp_path,
+        mesh={"source": "ball.ply"},
+        cages={"cell_size": 0.2},
+        material=solid_of(1e6, 0.3, density=100.0, damping=2.0),
+        time={"step": 0.02, "duration": 0.04, "integrator": "bdf2"},
+        self_contact={"distance": 2e-3},
+        obstacle=plates,
+    )
+    _, frames = play(scene)
+    assert len(frames) == 3
+
+
 def test_a_ring_is_pushed_down_a_cone(tmp_path: Path):
     """A cone widens the ring; the plate moves on by 80 barrier distances in a step."""
     ring = trimesh.creation.annulus(

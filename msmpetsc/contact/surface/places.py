@@ -17,6 +17,9 @@ triangle. The energy is thus
 The energy of an edge and its candidate edges is analogous; its links are shared vertices. Links
 join candidates alone. Links of all triangles of the mesh would also subtract triangles that are no
 candidates, as in creases. The energy could then be negative.
+
+Exactly over an edge or a vertex b has no second derivative. Meshes that lie vertex over vertex are
+common. So places are chosen at points that are displaced at random, by some 1e-6 dhat.
 """
 
 from dataclasses import dataclass
@@ -47,6 +50,8 @@ if TYPE_CHECKING:
 # Least sum of weights at a place over the sum of their absolute values [-]; a smaller
 # sum is rounding.
 ROUNDING = 1e-9
+# Greatest component of the displacements of points for the choice of places [dhat]
+ASIDE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -88,6 +93,7 @@ class Places:
             ((ends[:, 1] - ends[:, 0]) ** 2).sum(axis=1),
             mesh.num_vertices + mesh.num_edges + mesh.num_faces,
         )
+        self.aside = ASIDE * np.random.default_rng(0).uniform(-1, 1, mesh.rest_positions.shape)
         self._shape = EDGES + 1, self.mesh.size, self.mesh.size, CROSSING + 1
 
     def build(
@@ -97,7 +103,7 @@ class Places:
         import ipctk
 
         parts = Parts.empty(4 * pairs.faces.shape[1] + 5 * pairs.edges.shape[1])
-        at, square = np.ascontiguousarray(points), distance**2
+        at, square = np.ascontiguousarray(points + distance * self.aside), distance**2
         count = add_faces(pairs.faces, self.mesh, at, square, parts)
         count = add_edges(pairs.edges, self.mesh, at, square, parts, count)
         weight, pair = parts.weight[:count], parts.pair[:count]

@@ -125,7 +125,11 @@ class Optimality:
         functional, estimate, relative = self.functional, self.estimate, self._relative
         second = estimate(examined, max(acceptable - first, 0.0) if lowest > CONVEX else 0.0)
         if not np.isfinite(second):
-            return relative(first + bound, examined) if lowest > CONVEX else np.inf
+            if lowest > CONVEX:
+                return relative(first + bound, examined)
+            # CG has met a negative curvature that the last search has missed
+            self.curvature.forget()
+            return np.inf
         if functional.surface is not None:
             end, _, is_free = self._corrected(examined)
             functional.vectors.give_back(end)

@@ -22,6 +22,7 @@ from msmpetsc.solve.nonlinear.functional import Configuration, StepFunctional
 from msmpetsc.solve.nonlinear.lobpcg import (
     DEPENDENT,
     EFFORT,
+    LONGEST_SEARCH,
     TINY,
     UNIFORM_EFFORT,
     Lobpcg,
@@ -198,11 +199,11 @@ class LowestCurvature:
         # No rigid motion delays a mode, and all modes converge fast
         if rigid is None and is_uniform:
             start = [noise(block - len(known)), *known]
-            return search.lowest(start, block, least)
+            return search.lowest(start, block, LONGEST_SEARCH, least)
         start = [search.without(rigid, noise(block - is_uniform * len(known)))]
-        _, modes = search.lowest(start, block, least, left_out=rigid)
+        _, modes = search.lowest(start, block, LONGEST_SEARCH, least, left_out=rigid)
         start = [modes, *known, *([] if rigid is None else [rigid])]
-        return search.lowest(start, block, least // 2)
+        return search.lowest(start, block, LONGEST_SEARCH, least // 2)
 
     def _rigid_motions(self, q: Positions) -> Rows | None:
         """Return translations and rotations (k, n), k <= 6, of a free body at positions q (l, 3).

@@ -19,6 +19,8 @@ from msmpetsc.solve.linear.operators import TrueHessian
 from msmpetsc.solve.nonlinear.functional import StepFunctional
 from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 
+# Greatest number of iterations of a long search
+LONGEST_SEARCH = 100
 # Ratio of the lowest eigenvalue to its value at half as many iterations, above which a
 # long search ends [-]; its inverse for negative eigenvalues
 SETTLED = 0.95
@@ -115,16 +117,16 @@ class Lobpcg:
         self,
         start: list[Rows],
         block: int,
+        most: int,
         least: int,
-        most: int | None = None,
         left_out: Rows | None = None,
     ) -> tuple[Floats, Rows]:
         """Return the lowest eigenvalues (k,), k <= block, of M^(-1) H and their modes (k, n).
 
         start    : directions (l, n) in parts, which the search takes out of the list
         block    : number of modes to search
+        most     : greatest number of iterations
         least    : least number of iterations
-        most     : greatest number of iterations; None for no limit
         left_out : directions (r, n), orthonormal in M, that the search leaves out
         """
         lowest = []
@@ -133,8 +135,7 @@ class Lobpcg:
             if its == most:
                 break
             least_its, settled = (2, 1 / SETTLED) if lowest[-1] < 0 else (max(least, 1), SETTLED)
-            # The eigenvalue may be infinite or NaN
-            if its >= least_its and not lowest[-1] < settled * lowest[its // 2]:
+            if its >= least_its and lowest[-1] > settled * lowest[its // 2]:
                 break
         return ritz[0], ritz[1].copy()
 

@@ -37,8 +37,8 @@ class Preset:
     iterations: int | None = None
 
 
-# greatest number of CG iterations in a step, and greatest value of an option that is a
-# count; so that every step ends
+# greatest number of iterations in a step, those of CG included, and greatest value of
+# an option that is a count; so that every step ends
 MOST_ITERATIONS = 100_000
 CHOLESKY = {"ksp_type": "preonly", "pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps"}
 CG = {"ksp_type": "cg", "ksp_norm_type": "natural"}

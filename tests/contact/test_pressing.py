@@ -66,7 +66,6 @@ def test_a_plate_presses_a_free_block_on_a_floor(tmp_path: Path, way: str):
     assert frames[-1].push[1, 2] < -weight[2]
 
 
-@pytest.mark.slow
 def test_a_tip_over_an_edge_leaves_its_saddle(tmp_path: Path):
     """Two plates meet a ball whose poles lie over edges of the plates.
 
@@ -93,6 +92,7 @@ def test_a_tip_over_an_edge_leaves_its_saddle(tmp_path: Path):
     assert len(frames) == 3
 
 
+@pytest.mark.slow
 def test_a_ring_is_pushed_down_a_cone(tmp_path: Path):
     """A cone widens the ring; the plate moves on by 80 barrier distances in a step."""
     ring = trimesh.creation.annulus(

@@ -121,7 +121,7 @@ def test_the_lowest_curvature_is_that_of_a_dense_matrix(
     assert stepper.jacobian.preconditioner.is_uniform == multigrid
     dense, root = dense_hessian(stepper), np.sqrt(functional.mass)
     lowest = np.linalg.eigvalsh(dense / root / root[:, None])[0]
-    # below 0 a direction is a mix of the modes that are nearly as low
+    # below 0 a direction is a mix of the modes found below 0
     rayleigh = direction @ dense @ direction / (direction**2 @ functional.mass)
     assert found - 1e-9 <= rayleigh <= (0.0 if found < 0 else found) + 1e-9
     assert found >= lowest - 1e-9 and (found < 0) == (lowest < 0)

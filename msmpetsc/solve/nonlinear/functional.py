@@ -311,7 +311,8 @@ class Rounding:
     def explains(self, iterate: Iterate) -> bool:
         """Return whether F is rounding alone.
 
-        Rows are tested one by one, since soft parts have less rounding than stiff parts.
+        Each row counts by its own rounding, since soft parts have less rounding than stiff parts.
+        Then the mean square of all rows decides.
         """
         functional, known = self.functional, self.rows
         if iterate.contact:

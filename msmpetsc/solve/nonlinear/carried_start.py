@@ -28,10 +28,9 @@ from msmpetsc.solve.nonlinear.jacobian import Jacobian
 # Greatest relative tolerance of a linear solve that moves anchors and obstacles [-];
 # stiff contact dominates its right-hand side, so soft modes need more digits
 MOVING_RTOL = 3e-5
-# Number of directions between checks of the progress; pressing a body takes 5 to 30
-PATIENCE = 20
-# Least progress in s between checks; with less progress the step is refused
-PROGRESS = 0.1
+# Greatest number of moves of anchors and obstacles in a step; pressing a body takes up
+# to 46
+MOST_MOVES = 100
 # Number of corrections at fixed s before each move; a correction doubles a gap that the
 # last move has closed
 CORRECTIONS = 2
@@ -99,27 +98,24 @@ class CarriedStart:
         """Return the start at s = 1 by Newton's directions. Raises StepFailed and StepStopped."""
         functional, problem, begin = self.functional, self.functional.problem, contacts.begin
         is_fixed, still = functional.lattice.fixed, np.zeros((1, 3))
-        q, s, gained = problem.q, 0.0, 1.0
-        while gained > PROGRESS:
-            begun = s
-            for _ in range(PATIENCE):
-                now = begin + s * (end - begin)
-                left = np.where(is_fixed, (1 - s) * (problem.fixed_positions - problem.q), 0.0)
-                contacts.time, functional.problem = (
-                    now,
-                    replace(problem, prescribed=problem.fixed_positions - left),
-                )
-                for _ in range(CORRECTIONS):
-                    direction = self._direction(q, np.zeros_like(left), still, self.rtol)
-                    q = q + functional.collision_free_step(q, q + direction) * direction
-                onward = contacts.obstacles.displacements(now, end)
-                direction = self._direction(q, left, onward, min(self.rtol, MOVING_RTOL))
-                contacts.time = end
-                share = functional.collision_free_step(q, q + direction, now)
-                if share == 1.0:
-                    return q + direction
-                q, s = q + share * direction, s + share * (1 - s)
-            gained = s - begun
+        q, s = problem.q, 0.0
+        for _ in range(MOST_MOVES):
+            now = begin + s * (end - begin)
+            left = np.where(is_fixed, (1 - s) * (problem.fixed_positions - problem.q), 0.0)
+            contacts.time, functional.problem = (
+                now,
+                replace(problem, prescribed=problem.fixed_positions - left),
+            )
+            for _ in range(CORRECTIONS):
+                direction = self._direction(q, np.zeros_like(left), still, self.rtol)
+                q = q + functional.collision_free_step(q, q + direction) * direction
+            onward = contacts.obstacles.displacements(now, end)
+            direction = self._direction(q, left, onward, min(self.rtol, MOVING_RTOL))
+            contacts.time = end
+            share = functional.collision_free_step(q, q + direction, now)
+            if share == 1.0:
+                return q + direction
+            q, s = q + share * direction, s + share * (1 - s)
         contacts.time = begin + s * (end - begin)
         raise StepFailed(
             f"cannot lead anchors and obstacles on: "

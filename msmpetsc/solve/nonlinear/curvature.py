@@ -24,6 +24,7 @@ from msmpetsc.solve.nonlinear.lobpcg import (
     EFFORT,
     LONGEST_SEARCH,
     TINY,
+    UNCHANGED,
     UNIFORM_EFFORT,
     Lobpcg,
     SearchEffort,
@@ -33,8 +34,6 @@ from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 # Growth of the compression, or of the mode's curvature, beyond which another mode may
 # be the lowest [-]
 MORE = 2.0
-# Relative change of the mode's curvature up to which the mode is not searched again [-]
-UNCHANGED = 0.1
 
 
 class Alarm(IntEnum):

@@ -33,9 +33,8 @@ from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctiona
 FULL_STEP_ERROR = 1e-5
 # Assumed ratio of the bound to the error before the first estimate [-]
 FIRST_RATIO = 5.0
-# Factor on the goal after a doubt [-]; least goal [target], which is also the least
-# tolerance of a linear solve [ksp_rtol]
-CLOSER, CLOSEST = 0.1, 1e-3
+# Least goal, after a doubt [target]; also the least tolerance of a linear solve [ksp_rtol]
+CLOSEST = 1e-3
 # DIVERGED_FNORM_NAN, which PETSc 3.25 renames
 NOT_FINITE = -4
 KINDS = {
@@ -194,17 +193,19 @@ class ErrorControl:
     def doubt(self, now: Outcome, has_moved: bool) -> Outcome | None:
         """Return the outcome from which a step goes on after a doubt.
 
-        If the step has left a saddle, the goal stays. Otherwise the goal becomes smaller: a second
-        correction has shown that g is not quadratic, so an error bound of the same size says
-        nothing. Return None if the step has not moved, met no saddle, and has the smallest goal.
+        If the step has left a saddle, the goal stays. Otherwise the goal becomes the least goal: a
+        second correction has shown that g is not quadratic, so an error bound of the same size says
+        nothing. A step that cannot leave a saddle takes smaller goals still. Return None if the
+        step has not moved, met no saddle, and has the least goal.
 
         has_moved : whether the step goes on from another point
         """
-        is_saddle, closest = np.isinf(now.error), CLOSEST * self.target
-        goal = now.goal if has_moved and is_saddle else CLOSER * now.goal
-        if not has_moved and goal < closest and not is_saddle:
+        is_saddle, goal = np.isinf(now.error), CLOSEST * self.target
+        if is_saddle:
+            goal = now.goal if has_moved else CLOSEST * now.goal
+        elif not has_moved and now.goal <= goal:
             return None
-        goal = max(goal, min(closest, now.goal)) if has_moved else goal
+        goal = min(goal, now.goal)
         return replace(now, goal=goal, doubts=now.doubts + 1, bound=np.inf, corrected=False)
 
     def forget(self) -> None:

@@ -32,9 +32,6 @@ NEGLIGIBLE = 1e-6
 # Displacement by a load beyond which no digits of the body's shape are left [body's
 # greatest coordinate]
 FARTHEST = 1e6
-# Ratio of the displacement by rounding to the displacement by forces beyond which a
-# step is refused [-]
-HOPELESS = 0.3
 
 
 @dataclass(frozen=True)
@@ -348,16 +345,16 @@ class Rounding:
         """
         extent = self.functional.extent
         moved, size = self.displacement, self.size * extent
-        if moved > max(NEGLIGIBLE * size, HOPELESS * away):
+        if moved > max(NEGLIGIBLE * size, away):
             raise StepFailed(
                 f"cannot be solved in double precision: rounding in the stiffest springs moves the "
                 f"body by {moved / self.size:.1e} m, its forces by {away / self.size:.1e} m; "
                 "try softer materials, less different ones, or a smaller time.step",
                 "rounding",
             )
-        if is_rounding and HOPELESS * away < error * away <= NEGLIGIBLE * size:
+        if is_rounding and away < error * away <= NEGLIGIBLE * size:
             # The body is at rest
             moved = error * away
-        if not away > moved / HOPELESS:
+        if not away > moved:
             return moved / max(size, sys.float_info.min)
         return max(error, moved / away)

@@ -21,9 +21,9 @@ from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 
 # Greatest number of iterations of a long search
 LONGEST_SEARCH = 100
-# Ratio of the lowest eigenvalue to its value at half as many iterations, above which a
-# long search ends [-]; its inverse for negative eigenvalues
-SETTLED = 0.95
+# Relative change of an eigenvalue that counts as none [-]. A long search ends after twice
+# the iterations without a change; a mode without a change is not searched again.
+UNCHANGED = 0.1
 TINY = np.finfo(float).tiny
 # Relative eigenvalue of a Gram matrix below which directions are linearly dependent [-]
 DEPENDENT = 1e-10
@@ -134,8 +134,9 @@ class Lobpcg:
             lowest.append(ritz[0][0])
             if its == most:
                 break
-            least_its, settled = (2, 1 / SETTLED) if lowest[-1] < 0 else (max(least, 1), SETTLED)
-            if its >= least_its and lowest[-1] > settled * lowest[its // 2]:
+            least_its = 2 if lowest[-1] < 0 else max(least, 1)
+            fall = lowest[its // 2] - lowest[-1]
+            if its >= least_its and fall <= UNCHANGED * abs(lowest[-1]):
                 break
         return ritz[0], ritz[1].copy()
 

@@ -10,14 +10,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from mpi4py import MPI
 
-from msmpetsc.backend.arrays import Floats, Positions, Rows
+from msmpetsc.backend.arrays import Floats, Positions, Rows, to_host
 from msmpetsc.build import Model
 from msmpetsc.comm import reduced
 from msmpetsc.environment import Environment
 from msmpetsc.errors import InputError, StepFailed
 from msmpetsc.scene.reading import Scene
 from msmpetsc.scene.time import STATIC
-from msmpetsc.solve.integrators.static import SLENDER, Static, time_of_sound
+from msmpetsc.solve.integrators.static import SLENDER, Static, rigid_motions_stopped, time_of_sound
+from msmpetsc.solve.linear.unknowns import Unknowns
+from msmpetsc.solve.multigrid.free_bodies import bodies_of
 from msmpetsc.solve.nonlinear.functional import StepProblem
 from msmpetsc.solve.nonlinear.lobpcg import Lobpcg
 from msmpetsc.solve.nonlinear.step import Stepper
@@ -106,7 +108,8 @@ def _about(
         functional.begin(replace(problem, q=q, y=q))
         with petsc_errors("PETSc cannot find modes", stepper):
             stepper.jacobian.linearise(functional.configuration(q), False, None)
-            squares, modes = _lowest(stepper.optimality.curvature.search, count)
+            most = _most_rigid(unknowns)
+            squares, modes = _lowest(stepper.optimality.curvature.search, count, most)
         order = np.lexsort((squares, squares != 0))
         shapes = np.zeros((count, lattice.owned, 3))
         shapes[:, unknowns.free] = modes[order].reshape(count, 3, -1).transpose(0, 2, 1)
@@ -116,8 +119,21 @@ def _about(
     return Modes(frequencies[order], shapes, q[: lattice.owned], int((squares == 0).sum()))
 
 
-def _lowest(search: Lobpcg, count: int) -> tuple[Floats, Rows]:
+def _most_rigid(unknowns: Unknowns) -> int:
+    """Return an upper bound of the number of rigid modes (collective).
+
+    A single body has as many as its holders leave. Each of several bodies may have six.
+    """
+    lattice, bodies = unknowns.lattice, len(bodies_of(unknowns).free)
+    if bodies > 1:
+        return 6 * bodies
+    return 6 - rigid_motions_stopped(unknowns, to_host(lattice.fixed[: lattice.owned]))
+
+
+def _lowest(search: Lobpcg, count: int, most: int) -> tuple[Floats, Rows]:
     """Return the lowest (omega tau)^2 (count,), 0 for rigid modes, and the modes (count, n).
+
+    most : greatest number of rigid modes. Further modes may be as soft, beside a stiff part.
 
     Raises StepFailed if they do not converge.
     """
@@ -127,7 +143,8 @@ def _lowest(search: Lobpcg, count: int) -> tuple[Floats, Rows]:
         range(MOST_ITERATIONS), search.iterates(start, block), strict=False
     ):
         squares = values[:count] - 1
-        squares[np.abs(squares) < RIGID] = 0.0
+        softest = np.argsort(np.abs(squares))[:most]
+        squares[softest[np.abs(squares[softest]) < RIGID]] = 0.0
         error = (errors[:count] / np.where(squares, np.abs(squares), 1.0)).max()
         if error <= ACCURACY:
             return squares, _turned(search, squares, modes[:count])

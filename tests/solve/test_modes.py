@@ -90,6 +90,22 @@ def test_a_bar_on_rollers_keeps_the_rigid_motions_they_leave(
     assert (np.abs(found.frequencies / of_free_bar - 1).min() < 1e-7) == (fix == "x")
 
 
+@pytest.mark.parametrize(("pins", "rigid"), [(CLAMP, 0), ([], 6)])
+def test_soft_bending_beside_stiff_parts_is_not_rigid(tmp_path: Path, pins: list, rigid: int):
+    """A bar's frequencies do not depend on the stiffness of its ends, if these are far stiffer.
+
+    The bar is clamped at an end or free.
+    """
+    stiff = [{"half_space": {"point": [x, 0, 0], "normal": [x - 0.5, 0, 0]}} for x in (0.3, 0.7)]
+    frequencies = []
+    for ratio in (1e3, 1e6):
+        parts = [{"region": end, "young_modulus": ratio * YOUNG, "density": 1e4} for end in stiff]
+        found = modes(body(tmp_path, [1, 0.1, 0.1], 0.05, part=parts, pin=pins), rigid + 3)
+        assert found.rigid == rigid
+        frequencies.append(found.frequencies[rigid:])
+    np.testing.assert_allclose(*frequencies, rtol=0.01)
+
+
 def test_modes_of_a_loaded_body_are_those_of_its_state(tmp_path: Path):
     """A sagging beam has the same modes from a static scene and from its file."""
     loaded = {"pin": CLAMP, "gravity": {"acceleration": [0, 0, -40.0]}}

@@ -202,8 +202,8 @@ class Static(ImplicitEuler):
         return result, path
 
 
-def _prevents_rigid_motion(unknowns: Unknowns, fixed: Mask) -> bool:
-    """Return whether fixed components (owned, 3) prevent all six rigid motions (collective)."""
+def rigid_motions_stopped(unknowns: Unknowns, fixed: Mask) -> int:
+    """Return how many of six rigid motions fixed components (owned, 3) prevent (collective)."""
     lattice = unknowns.lattice
     node, component = np.nonzero(fixed)
     x = to_host(lattice.nodes)[node] / lattice.cell_size
@@ -212,7 +212,7 @@ def _prevents_rigid_motion(unknowns: Unknowns, fixed: Mask) -> bool:
     # rotations about each axis, along the component
     turns = np.cross(np.eye(3), x[:, None])[np.arange(len(node)), :, component]
     motions = np.hstack([np.eye(3)[component], turns])
-    return bool(np.linalg.matrix_rank(reduced(unknowns.comm, motions.T @ motions)) == 6)
+    return int(np.linalg.matrix_rank(reduced(unknowns.comm, motions.T @ motions)))
 
 
 def time_of_sound(lattice: Lattice) -> float:
@@ -242,7 +242,7 @@ def refuse_free_bodies(unknowns: Unknowns) -> None:
     if free.any():
         along = [axis for axis, moves in zip("xyz", bodies.free[free][0], strict=True) if moves]
         support = f"held by nothing along {', '.join(along)}"
-    elif _prevents_rigid_motion(unknowns, fixed):
+    elif rigid_motions_stopped(unknowns, fixed) == 6:
         return
     subject = "the body"
     if len(bodies.free) > 1:

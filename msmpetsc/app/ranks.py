@@ -25,6 +25,8 @@ VARIABLES_OF_MPI = (
     "OMPI_MCA_orte_hnp_uri", "OMPI_MCA_orte_local_daemon_uri", "OMPI_MCA_orte_jobfam_",
     "OMPI_MCA_pmix",
 )  # fmt: skip
+# largest number of ranks [-]; far above any machine
+MOST_RANKS = 10**6
 # settings of Open MPI 4 and 5 that allow more ranks than cores
 OVERSUBSCRIBED = {
     "OMPI_MCA_rmaps_base_oversubscribe": "1",

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from msmpetsc.app.checks import checked_file, checked_path
+from msmpetsc.app.ranks import MOST_RANKS
 from msmpetsc.app.request import OPTIONS, flag_of
 from msmpetsc.results.frame_choice import frames_in
 
@@ -106,9 +107,17 @@ def frames(about: str) -> Argument:
     return argument("--frames", metavar="0,10,20", type=frames_in, help=about)
 
 
+def rank_count(word: str) -> int:
+    """Return a word as a number of ranks; a ``type`` for argparse."""
+    count = at_least_1(word)
+    if count > MOST_RANKS:
+        raise argparse.ArgumentTypeError(f"must be at most {MOST_RANKS}, not {word}")
+    return count
+
+
 def ranks(about: str) -> Argument:
-    """Return the option ``--ranks`` of commands that start runs."""
-    return whole("--ranks", "R", about, default=1)
+    """Return the option ``--ranks``."""
+    return argument("--ranks", type=rank_count, metavar="R", help=about, default=1)
 
 
 RENDER = (

@@ -19,6 +19,7 @@ from pydantic import (
     model_validator,
 )
 
+from msmpetsc.app.ranks import MOST_RANKS
 from msmpetsc.errors import InputError, did_you_mean
 from msmpetsc.scene.problems import problem_lines, rule
 from msmpetsc.scene.reading import OF_STUDIES, read_toml
@@ -38,6 +39,7 @@ Error = Annotated[float, Field(gt=0, lt=1)]
 # an override of the scene as in --set: "key.path=value"
 Override = Annotated[str, Field(min_length=3)]
 Name = Annotated[str, Field(min_length=1)]
+Ranks = Annotated[int, Field(gt=0, le=MOST_RANKS)]
 
 
 def _solver_options(options: str) -> str:
@@ -148,7 +150,7 @@ class Sweep(Table):
     substeps: ListOf[Positive] = ()
     errors: ListOf[Error] = ()
     max_iterations: ListOf[Count] = ()
-    ranks: ListOf[Count] = (1,)
+    ranks: ListOf[Ranks] = (1,)
     steps: Count | None = None
     set: ListOf[Override] = ()
     label: str = ""

@@ -104,6 +104,14 @@ TOO_MUCH = {
         ["inspect", "scene.toml", "--ranks", "9999999999"],
         "--ranks must be at most 1000000",
     ),
+    "ranks of trials": (
+        ["plan", "scene.toml", "--ranks", "9999999999"],
+        "--ranks must be at most 1000000",
+    ),
+    "ranks of a check": (
+        ["check", "scene.toml", "--ranks", "9999999999"],
+        "--ranks must be at most 1000000",
+    ),
     "part": (["study", "study.toml", "--part", "1/" + "9" * 5000], "--part must read I/N"),
     "listed part": (["study", "study.toml", "--list", "--part", "1/2"], "leave out --part"),
     "frames": (

@@ -20,6 +20,7 @@ from msmpetsc.study.study_file import load_study
         ("[[sweep]]\nprests = []", ["sweep.0.prests", "'presets'"]),
         ('[[sweep]]\npresets = ["newtom"]', ["sweep.0.presets.0", "newton"]),
         ("[[sweep]]\nerrors = [2.0]", ["sweep.0.errors.0", "must be less than 1"]),
+        ("[[sweep]]\nranks = [9999999]", ["sweep.0.ranks.0", "less than or equal to 1000000"]),
         ('[[sweep]]\noptions = ["-pc_type \'icc"]', ["sweep.0.options.0", "no closing quotation"]),
         ('reference.integrator = "bdf2"\n[[sweep]]', ["scene.0.reference", "needs step"]),
         ("steps = 3\nduration = 0.5\n[[sweep]]", ["scene.0.duration", "beside steps"]),

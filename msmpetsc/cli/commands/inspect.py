@@ -19,7 +19,7 @@ from msmpetsc.backend.arrays import Floats
 from msmpetsc.backend.machine import peak_memory
 from msmpetsc.build import read_bodies
 from msmpetsc.comm import log
-from msmpetsc.errors import InputError, body_names
+from msmpetsc.errors import body_names
 from msmpetsc.geometry.cages import BodySurface, fill
 from msmpetsc.geometry.cell_size import (
     choose_cell_size,
@@ -38,8 +38,6 @@ from msmpetsc.solve.petsc.initialise import initialise
 
 # largest lattice built to count [cells]; counts of a larger lattice are scaled
 MOST_BUILT = 200_000
-# largest number of ranks [-]; far above any machine
-MOST_RANKS = 10**6
 GB = 1e9
 # memory of a rank without its nodes [byte]; this and the next three numbers were
 # measured in runs of 3,000 to 350,000 nodes
@@ -79,8 +77,6 @@ def partition_of(
 
 def run(args: argparse.Namespace) -> int:
     """Inspect a scene; return the exit status."""
-    if args.ranks > MOST_RANKS:
-        raise InputError(f"--ranks must be at most {MOST_RANKS}, not {args.ranks}")
     initialise(MPI.COMM_WORLD, [])
 
     scene = load_scene(args.scene, args.set)

@@ -33,6 +33,8 @@ from msmpetsc.study.table import Row, read_table, records, require_extra, write_
 
 # folder of the parts' folders
 PARTS = "parts"
+# first words of a reason
+NO_REFERENCE = "no reference: "
 
 
 @dataclass
@@ -101,12 +103,14 @@ class Bench:
                 ended = self._run(case.reference, part)
                 if self.processes.stopped:
                     return None, "stopped"
-                if ended.reason:
-                    write_whole(failed, ended.reason)
-                else:
+                if not ended.reason:
                     os.replace(part, path)
+                elif not _is_unwritten(case.reference, ended.reason):
+                    write_whole(failed, ended.reason)
                 _remove_files(part, log=not ended.reason)
-        return (path, "") if path.is_file() else (None, f"no reference: {failed.read_text()}")
+                if ended.reason:
+                    return None, f"{NO_REFERENCE}{ended.reason}"
+        return (path, "") if path.is_file() else (None, f"{NO_REFERENCE}{failed.read_text()}")
 
 
 def _figures(case: Case, path: Path, record: dict[str, Any]) -> tuple[Row, str]:
@@ -285,8 +289,26 @@ def _earlier_rows(folder: Path) -> list[Row]:
 
 
 def _is_done(case: Case, rows: dict[str, Row]) -> bool:
-    """Return whether a case is done: it has a row, which is no timeout under another time limit."""
+    """Return whether a case is done: it has a row, which tells of the case.
+
+    A timeout under another time limit, and a file that could not be written, do not count.
+    """
     row = rows.get(case.id)
-    return row is not None and not (
-        row["status"] == "timeout" and row["reason"] != too_long(case.timeout)
+    if row is None:
+        return False
+    reason = row["reason"]
+    if row["status"] == "timeout":
+        return bool(reason == too_long(case.timeout))
+    if row["status"] == "failed" and _is_unwritten(case, reason):
+        return False
+    return case.reference is None or not (
+        reason.startswith(NO_REFERENCE) and _is_unwritten(case.reference, reason)
     )
+
+
+def _is_unwritten(case: Case, reason: str) -> bool:
+    """Return whether a run failed because its own files cannot be written: it names such a file.
+
+    The disk may be full, or a run that outlived a killed study may still write the file.
+    """
+    return f"{case.id}." in reason

@@ -48,6 +48,7 @@ if __name__ == "__main__":
 import numpy as np  # noqa: E402
 from mpi4py import MPI  # noqa: E402
 
+from msmpetsc.errors import InputError  # noqa: E402
 from msmpetsc.fields import Frame  # noqa: E402
 from msmpetsc.results.writer import Begin, ResultFile  # noqa: E402
 
@@ -99,4 +100,7 @@ def told(ranks: int, count: int) -> dict:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except InputError as error:
+        sys.exit(f"msmpetsc: error: {error}")

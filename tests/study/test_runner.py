@@ -6,13 +6,24 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
 
 import pytest
 from conftest import ENVIRONMENT
 from one_process import command_error
-from study_files import ONE_SCENE, alive, calls, carry_out, own_log, stand_in, study_file  # noqa: F401 (fixtures)
+from study_files import (  # noqa: F401 (fixtures)
+    ONE_SCENE,
+    alive,
+    all_cases,
+    calls,
+    carry_out,
+    own_log,
+    stand_in,
+    study_file,
+)
 
 from msmpetsc.cli.main import main
 from msmpetsc.errors import InputError
@@ -83,23 +94,48 @@ def test_cases_of_another_study_are_not_dropped(tmp_path: Path, stand_in):
     assert run_study(other, tmp_path / "out")[0] == row
 
 
+@contextmanager
+def another_run_writes(path: Path) -> Iterator[None]:
+    """Let another process hold the lock of this file during the block."""
+    holder = "import sys; from pathlib import Path; from msmpetsc.results.disk import Lock\n"
+    holder += "lock = Lock(Path(sys.argv[1])); print(flush=True); input(); lock.close()"
+    words = [sys.executable, "-c", holder, str(path)]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(words, env=ENVIRONMENT, stdin=pipe, stdout=pipe) as other:
+        other.stdout.readline()
+        yield
+        other.communicate(b"\n")
+
+
 def test_two_studies_do_not_share_a_folder_at_a_time(tmp_path: Path, stand_in):
     path, out = (
         study_file(tmp_path, ONE_SCENE + '[[sweep]]\npresets = ["newton"]'),
         tmp_path / "out",
     )
     out.mkdir()
-    holder = "import sys; from pathlib import Path; from msmpetsc.results.disk import Lock\n"
-    holder += "lock = Lock(Path(sys.argv[1])); print(flush=True); input()"
-    words = [sys.executable, "-c", holder, str(out / "table.csv")]
-    pipe = subprocess.PIPE
-    with subprocess.Popen(words, env=ENVIRONMENT, stdin=pipe, stdout=pipe) as other:
-        other.stdout.readline()
+    with another_run_writes(out / "table.csv"):
         with pytest.raises(InputError, match=r"table\.csv is being written by another run"):
             run_study(path, out, restart=True)
         assert not (out / "study.toml").exists()
-        other.communicate(b"\n")
     assert len(run_study(path, out)) == 1 and not list(out.glob(".*"))
+
+
+REFERENCE = 'reference = { integrator = "implicit-euler", step = 0.01 }\n'
+
+
+@pytest.mark.parametrize("file", ["runs/{0}.h5", "references/{1}.part.h5"])
+def test_a_case_whose_file_cannot_be_written_is_run_again(tmp_path: Path, stand_in, file: str):
+    text = ONE_SCENE + REFERENCE + '[[sweep]]\npresets = ["newton"]\ntime_steps = [0.005]'
+    (case,) = all_cases(tmp_path, text)
+    path = tmp_path / "out" / file.format(case.id, case.reference.id)
+    path.parent.mkdir(parents=True)
+    with another_run_writes(path):
+        (row,) = carry_out(tmp_path, text)
+    assert "is being written by another run" in row["reason"] and row["trajectory_error"] is None
+    (row,) = carry_out(tmp_path, text)
+    assert (row["status"], row["reason"]) == ("ok", "") and row["trajectory_error"] > 0
+    carry_out(tmp_path, text)
+    assert len(calls(tmp_path)) == 4 - file.startswith("runs")
 
 
 @pytest.mark.parametrize("part", ["3", "0/3", "4/3", "a/3"])

@@ -8,7 +8,7 @@ import numpy as np
 
 from msmpetsc.backend.arrays import Floats
 from msmpetsc.fields import FRAME_FIELDS, STRESS
-from msmpetsc.results.disk import write_whole
+from msmpetsc.results.disk import whole_file
 from msmpetsc.results.reader import Result
 
 NUMBER_TYPES = {"f": "Float", "i": "Int", "u": "UInt"}
@@ -22,15 +22,24 @@ def write_xdmf(h5_path: str | Path) -> Path:
     lattice cells, with any stored stress. Both have displacement and velocity.
     """
     h5_path = Path(h5_path)
-    with Result(h5_path) as run:
-        grids: list[str] = []
-        if "surface" in run.frames:
-            grids += _collection(run, "surface", "Triangle", "surface/triangles", "surface")
-        grids += _collection(run, "lattice", "Hexahedron", "lattice/cells", "position")
     path = h5_path.with_suffix(".xdmf")
-    text = "\n".join([HEAD, *grids, "</Domain></Xdmf>\n"])
-    write_whole(path, text.encode(errors="xmlcharrefreplace"))
+    with (
+        Result(h5_path) as run,
+        whole_file(path) as part,
+        open(part, "w", encoding="utf-8", errors="xmlcharrefreplace") as file,
+    ):
+        # line by line, because a long run has 4 kB a frame
+        file.writelines(f"{line}\n" for line in _lines(run))
     return path
+
+
+def _lines(run: Result) -> Iterator[str]:
+    """Yield the lines of the file."""
+    yield HEAD
+    if "surface" in run.frames:
+        yield from _collection(run, "surface", "Triangle", "surface/triangles", "surface")
+    yield from _collection(run, "lattice", "Hexahedron", "lattice/cells", "position")
+    yield "</Domain></Xdmf>"
 
 
 def _collection(run: Result, name: str, kind: str, elements: str, points: str) -> Iterator[str]:

@@ -1,6 +1,7 @@
 """Independent libraries read exported files back and find the frames of the result."""
 
 import json
+import tracemalloc
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -213,6 +214,16 @@ def stressed(index: int) -> dict[str, np.ndarray]:
         values |= {f"{whose}{name}": index + np.arange(rows) for name in SCALARS}
         values[f"{whose}stress"] = index + np.arange(6.0 * rows).reshape(-1, 6)
     return values
+
+
+def test_xdmf_of_many_frames_takes_little_memory(tmp_path: Path):
+    path = small_result.write(tmp_path / "x.h5", [small_result.frame(n) for n in range(300)])
+    write_xdmf(path)
+    tracemalloc.start()
+    size = write_xdmf(path).stat().st_size
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < size / 2
 
 
 def test_stress_comes_with_xdmf(tmp_path: Path):

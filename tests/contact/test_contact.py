@@ -1,5 +1,6 @@
 """Penalty contact and friction: derivatives, blocks at rest, sliding blocks, moving obstacles."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -329,6 +330,38 @@ def test_a_line_search_that_finds_only_rounding_ends_the_step(tmp_path: Path):
     """A die at rest may start a step at the minimum. A run in twenty failed in this case."""
     for change in range(20, 40):
         assert come_to_rest(tmp_path, 1e10 * (1 - 1e-13 * change))[-1].kinetic < 1e-3
+
+
+@pytest.mark.parametrize(
+    "stiffer, step, speed", [(1e3, 0.1, 0.0), (1e4, 0.05, -1.0), (1e5, 0.1, -1.0)]
+)
+def test_a_block_with_a_stiff_part_lands_flat(
+    tmp_path: Path, stiffer: float, step: float, speed: float
+):
+    """The line search finds the step length at which a whole face touches the plane.
+
+    The stiff part makes the plane 10^4 to 10^6 times as stiff as the soft part. The pushes of the
+    plane and the weight give the rate of momentum.
+    """
+    part = {"region": half_space(0, 0.25, 1), "young_modulus": stiffer * 1e7}
+    scene = block_scene(
+        tmp_path,
+        np.array([0.5, 0.5, 0.5]),
+        part=[part],
+        material={"young_modulus": 1e7, "density": DENSITY},
+        time={"step": step, "duration": 5 * step},
+        gravity=GRAVITY,
+        start={"velocity": [1.0, 0.5, speed]},
+        obstacle=[plane_at(-0.01, response="penalty")],
+        solver={"preset": "newton", "error": 1e-4},
+    )
+    model, frames = play(scene)
+    weight = G * model.lattice.mass.sum()
+    for before, after in pairwise(frames):
+        force = after.push[0, 2] - weight
+        gained = (after.momentum[2] - before.momentum[2]) / step
+        assert gained == pytest.approx(force, abs=2e-3 * max(weight, after.push[0, 2]))
+    assert max(frame.push[0, 2] for frame in frames) > weight
 
 
 @pytest.mark.parametrize("given, error", [({}, 1e-9), ({"friction_speed": 1e-3}, 1e-6)])

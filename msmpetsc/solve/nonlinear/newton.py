@@ -1,25 +1,28 @@
 """Newton's method for a step, with the true Hessian H of g, CG, and a line search on g:
 
     H(x_k) y = F(x_k)                by CG, to the digits that the step still lacks
-    y <- y, bent at obstacles and shortened so that the surface crosses nothing
+    y <- y, shortened so that the surface crosses nothing
     x_(k+1) = x_k - s y              g(x_(k+1)) <= g(x_k) - ALPHA s y . F(x_k)     (Armijo)
 
-until the error of x_k is below the goal (error_control). Under compression H may be indefinite. CG
-then stops with the descent direction found so far. The next iteration takes the projected Hessian,
-without negative parts, and a new preconditioner. Otherwise iterations might close and open a gap
-between surfaces again and again. If CG's first direction has a negative curvature, no s lowers g,
-and y is computed again with the projected Hessian.
+until the error of x_k is below the goal (error_control). If y leads nodes into obstacles, a full
+step that stops these nodes is tried first.
+
+Under compression H may be indefinite. CG then stops with the descent direction found so far. The
+next iteration takes the projected Hessian, without negative parts, and a new preconditioner.
+Otherwise iterations might close and open a gap between surfaces again and again. If CG's first
+direction has a negative curvature, no s lowers g, and y is computed again with the projected
+Hessian.
 """
 
+import sys
 from dataclasses import dataclass, replace
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Array, Positions
+from msmpetsc.backend.arrays import Array
 from msmpetsc.comm import reduced
-from msmpetsc.contact.step_contact import StepContactAt
 from msmpetsc.solve.nonlinear.curvature import Alarm
 from msmpetsc.solve.nonlinear.error_control import Outcome
 from msmpetsc.solve.nonlinear.functional import Iterate
@@ -32,12 +35,11 @@ from msmpetsc.solve.petsc.events import LOCAL
 SOFTER = 9.0
 # Share of the slope by which a step must lower g [-] (Armijo)
 ALPHA = 1e-4
-# Least and greatest ratio of the next step length to the last in a line search [-]
-LEAST, MOST = 0.1, 0.5
-# Least step length [-]; along a rising direction g may seem to fall by rounding
-SHORTEST = 1e-6
-# Share of the slope that a direction must keep if bent at obstacles [-]
-DOWNHILL = 0.1
+# Greatest ratio of the next step length to the last in a line search [-]; least ratio if
+# g does not bend upwards
+MOST, LEAST = 0.9, 0.1
+# Least step length [-]: rounding of x
+SHORTEST = sys.float_info.epsilon
 # Options of PETSc's own convergence test of a linear solve
 TESTS = (
     "ksp_convergence_test",
@@ -116,8 +118,7 @@ class Newton(StepMethod):
             if outcome.is_converged:
                 reason = REASON.CONVERGED_SNORM_RELATIVE
                 break
-            self._limit(now)
-            lower = self._search(now, outcome.is_flat)
+            lower = self._lower(now, outcome.is_flat)
             if lower is None and projected:
                 reason = REASON.DIVERGED_LINE_SEARCH
                 break
@@ -237,83 +238,91 @@ class Newton(StepMethod):
         functional.vectors.give_back(change)
         return missed
 
-    def _search(self, now: Iterate, flat: bool) -> Iterate | None:
-        """Return the first iterate x - s y with sufficient descent; None if no s lowers g.
+    def _lower(self, now: Iterate, flat: bool) -> Iterate | None:
+        """Return an iterate of lower g: a full step bent at obstacles, or a step along y.
 
-        flat : whether g is so close to its minimum that its change has no digits; then take the
-               full step
+        flat : whether g is so close to its minimum that its change has no digits; then take a full
+               step
+
+        Return None if no step along y lowers g.
         """
-        slope, s, x = -abs(self.y.dot(now.f)), 1.0, self.functional.vectors.take()
-        longer = None
-        while s > SHORTEST:
-            x.waxpy(-s, self.y, now.x)
+        lower, bent = None, self._bent(now)
+        if bent:
+            lower = self._search(now, bent, 1.0, flat)
+            self.functional.vectors.give_back(bent)
+        lower = lower or self._search(now, self.y, SHORTEST, flat)
+        if lower is None:
+            self.friction.update(now.contact, now.contact, False)
+        return lower
+
+    def _search(self, now: Iterate, y: PETSc.Vec, shortest: float, flat: bool) -> Iterate | None:
+        """Return the first iterate x - s y with sufficient descent; None if s gets too short.
+
+        First y is shortened so that the surface crosses nothing.
+
+        shortest : least s
+        """
+        self._limit(now, y)
+        slope, s = -y.dot(now.f), 1.0
+        while slope <= 0 and s >= shortest:
+            x = self.functional.vectors.take()
+            x.waxpy(-s, y, now.x)
             with LOCAL:
-                configuration = self.functional.configuration(self.functional.positions(x))
-                self.friction.update(configuration.contact, now.contact, s == 1.0)
-                change, _ = (-np.inf, 0.0) if flat else self.functional.change(configuration, now)
-                if change <= ALPHA * s * slope:
-                    return self.functional.iterate(x, configuration)
-            s, longer = shorter(slope, (s, change), longer), (s, change)
-        self.functional.vectors.give_back(x)
+                end = self.functional.iterate(x)
+                change = -np.inf if flat else self.functional.change(end, now)[0]
+            if change <= ALPHA * s * slope:
+                self.friction.update(end.contact, now.contact, s == 1.0)
+                return end
+            s = shorter(s, change, slope, -y.dot(end.f))
         return None
 
-    def _limit(self, now: Iterate) -> None:
-        """Bend y at obstacles, then shorten y so that the surface crosses nothing."""
-        if now.contact is None:
+    def _limit(self, now: Iterate, y: PETSc.Vec) -> None:
+        """Shorten y so that the surface crosses nothing."""
+        if self.functional.surface is None:
             return
-        self.end.waxpy(-1.0, self.y, now.x)
+        self.end.waxpy(-1.0, y, now.x)
         with LOCAL:
-            end = self._stop_at_obstacles(now, now.contact, self.functional.positions(self.end))
+            end = self.functional.positions(self.end)
             share = self.functional.collision_free_step(now.q, end)
         if share < 1.0:
-            self.y.scale(share)
+            y.scale(share)
 
-    def _stop_at_obstacles(self, now: Iterate, contact: StepContactAt, end: Positions) -> Positions:
-        """Bend y so that nodes stop at obstacles that they would enter.
+    def _bent(self, now: Iterate) -> PETSc.Vec | None:
+        """Return y bent so that nodes stop at obstacles that they would enter; None if none would.
 
         H at x lacks obstacles that nodes do not touch yet. If the line search shortened the whole
-        step for these nodes, they would come into contact one by one. If the bent direction hardly
-        descends, y stays as it is.
-
-        end : positions (l, 3) [m] at x - y
-
-        Return the positions (l, 3) [m] at the end of the new y.
+        step for these nodes, they would come into contact one by one.
         """
-        functional, bent = self.functional, self.end
-        stopped = contact.stopped(end)
+        if now.contact is None:
+            return None
+        functional = self.functional
+        self.end.waxpy(-1.0, self.y, now.x)
+        with LOCAL:
+            end = functional.positions(self.end)
+            stopped = now.contact.stopped(end)
         if not reduced(functional.comm, stopped is not None, MPI.LOR):
-            return end
+            return None
+        bent = functional.vectors.take()
         functional.unknowns.from_nodes(end if stopped is None else stopped, bent)
-        # Fixed nodes stay at their places
-        free = functional.positions(bent)
         bent.aypx(-1.0, now.x)
-        if not bent.dot(now.f) > DOWNHILL * self.y.dot(now.f):
-            return end
-        bent.copy(self.y)
-        return free
+        return bent
 
 
-def shorter(slope: float, tried: tuple[float, float], longer: tuple[float, float] | None) -> float:
-    """Return the next step length of a line search.
+def shorter(s: float, change: float, slope: float, end_slope: float) -> float:
+    """Return the next step length of a line search, after a step of length s was too long.
 
-    The length minimises the cubic through the slope at 0 and the last two changes of g; after the
-    first trial, the parabola. It is between LEAST and MOST times the last length (Dennis and
-    Schnabel 1996, Numerical Methods for Unconstrained Optimization, A6.3.1). If the last change is
-    not finite, the length is LEAST times the last length.
+    The length minimises g along the direction in a model with a force from s_0 on, as of an
+    obstacle that nodes enter:
 
-    slope  : derivative of g by the step length at 0
-    tried  : last step length and change of g there
-    longer : step length before the last and change of g there; None after the first trial
+        g(s) - g(0) = slope s + K / 2 max(s - s_0, 0)^2
+
+    The change of g and its slope at s give K and s_0. For a quadratic g, s_0 is 0 and the length is
+    exact.
+
+    change    : change of g at s
+    slope     : derivative of g by the step length at 0
+    end_slope : derivative of g by the step length at s
     """
-    s, change = tried
-    if not np.isfinite(change):
-        return LEAST * s
-    bend = (change - s * slope) / s**2
-    best = -slope / (2 * bend)
-    if longer is not None and np.isfinite(longer[1]):
-        t, far = longer
-        of_far = (far - t * slope) / t**2
-        a, b = (bend - of_far) / (s - t), (s * of_far - t * bend) / (s - t)
-        if a != 0:
-            best = (-b + np.sqrt(max(b**2 - 3 * a * slope, 0.0))) / (3 * a)
-    return float(min(max(best, LEAST * s), MOST * s))
+    rise, bend = change - slope * s, end_slope - slope
+    best = s - 2 * rise / bend * end_slope / bend if end_slope > 0 else 0.0
+    return min(best, MOST * s) if best > 0 else LEAST * s

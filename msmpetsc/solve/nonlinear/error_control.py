@@ -33,7 +33,8 @@ from msmpetsc.solve.nonlinear.functional import Iterate, Rounding, StepFunctiona
 FULL_STEP_ERROR = 1e-5
 # Assumed ratio of the bound to the error before the first estimate [-]
 FIRST_RATIO = 5.0
-# Least goal, after a doubt [target]; also the least tolerance of a linear solve [ksp_rtol]
+# Least goal, after a doubt [target]; also the least tolerance of a linear solve
+# [ksp_rtol]
 CLOSEST = 1e-3
 # DIVERGED_FNORM_NAN, which PETSc 3.25 renames
 NOT_FINITE = -4

@@ -21,8 +21,8 @@ from msmpetsc.solve.nonlinear.preconditioning import StepPreconditioner
 
 # Greatest number of iterations of a long search
 LONGEST_SEARCH = 100
-# Relative change of an eigenvalue that counts as none [-]. A long search ends after twice
-# the iterations without a change; a mode without a change is not searched again.
+# Relative change of an eigenvalue that counts as none [-]. A long search ends after
+# twice the iterations without a change; a mode without a change is not searched again.
 UNCHANGED = 0.1
 TINY = np.finfo(float).tiny
 # Relative eigenvalue of a Gram matrix below which directions are linearly dependent [-]

@@ -35,8 +35,8 @@ from msmpetsc.solve.petsc.events import LOCAL
 SOFTER = 9.0
 # Share of the slope by which a step must lower g [-] (Armijo)
 ALPHA = 1e-4
-# Greatest ratio of the next step length to the last in a line search [-]; least ratio if
-# g does not bend upwards
+# Greatest ratio of the next step length to the last in a line search [-]; ratio if g
+# does not bend upwards
 MOST, LEAST = 0.9, 0.1
 # Least step length [-]: rounding of x
 SHORTEST = sys.float_info.epsilon

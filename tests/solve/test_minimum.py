@@ -241,12 +241,12 @@ def test_what_cg_has_left_is_no_bound_across_a_kink(
 
     Without a look at F at x - y, errors of 0.3 and 1.6 were reported as 0.08 and 0.07. In one scene
     a body springs back from an eighth of its length, in 70 iterations. Its path is chaotic, so the
-    median of five densities counts.
+    median of five densities counts: 0.36 without the look, 0.52 with it.
     """
     preset = 'solver.preset="newton-multigrid"'
     densities = [f"material.density={1000 + 0.01 * k}" for k in range(5)]
     said = [min(shares_said(seed, number, preset, rho, *changes)) for rho in densities]
-    assert np.median(said) > 1 / 3
+    assert np.median(said) > 0.43
 
 
 @pytest.mark.parametrize("seed, number, was", [(85, 40, 0.025), (85, 54, 0.078), (86, 115, 0.09)])

@@ -196,6 +196,7 @@ ALLOWED = {
     "results/disk.py": "the one way",
     "results/writer.py": "a result, which grows",
     "export/formats.py": "under the name that the one way gave",
+    "results/xdmf.py": "under the name that the one way gave",
     "backend/kernel_cache.py": "a cache",
     "study/process.py": "the log of a child",
     "study/runner.py": "a result that a child wrote gets its name",

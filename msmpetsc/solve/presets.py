@@ -37,7 +37,7 @@ class Preset:
     iterations: int | None = None
 
 
-# greatest number of iterations in a step, those of CG included, and greatest value of
+# greatest number of iterations in a step, with all of CG, and greatest value of
 # an option that is a count; so that every step ends
 MOST_ITERATIONS = 100_000
 CHOLESKY = {"ksp_type": "preonly", "pc_type": "cholesky", "pc_factor_mat_solver_type": "mumps"}

@@ -98,19 +98,19 @@ class Bench:
         path = self.folder / "references" / f"{case.reference.id}.h5"
         with self._locks.setdefault(case.reference.id, Lock()):
             failed = path.with_suffix(".failed")
-            if not path.is_file() and not failed.is_file():
+            reason = failed.read_text() if failed.is_file() else ""
+            if not path.is_file() and not reason:
                 part = path.with_suffix(".part.h5")
                 ended = self._run(case.reference, part)
                 if self.processes.stopped:
                     return None, "stopped"
-                if not ended.reason:
+                reason = ended.reason
+                if not reason:
                     os.replace(part, path)
-                elif not _is_unwritten(case.reference, ended.reason):
-                    write_whole(failed, ended.reason)
-                _remove_files(part, log=not ended.reason)
-                if ended.reason:
-                    return None, f"{NO_REFERENCE}{ended.reason}"
-        return (path, "") if path.is_file() else (None, f"{NO_REFERENCE}{failed.read_text()}")
+                elif not _is_unwritten(case.reference, reason):
+                    write_whole(failed, reason)
+                _remove_files(part, log=not reason)
+        return (path, "") if path.is_file() else (None, f"{NO_REFERENCE}{reason}")
 
 
 def _figures(case: Case, path: Path, record: dict[str, Any]) -> tuple[Row, str]:
@@ -307,7 +307,7 @@ def _is_done(case: Case, rows: dict[str, Row]) -> bool:
 
 
 def _is_unwritten(case: Case, reason: str) -> bool:
-    """Return whether a run failed because its own files cannot be written: it names such a file.
+    """Return whether a run failed because it cannot write its own files, which the reason names.
 
     The disk may be full, or a run that outlived a killed study may still write the file.
     """

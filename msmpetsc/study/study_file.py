@@ -39,7 +39,7 @@ Error = Annotated[float, Field(gt=0, lt=1)]
 # an override of the scene as in --set: "key.path=value"
 Override = Annotated[str, Field(min_length=3)]
 Name = Annotated[str, Field(min_length=1)]
-Ranks = Annotated[int, Field(gt=0, le=MOST_RANKS)]
+Ranks = Annotated[Count, Field(le=MOST_RANKS)]
 
 
 def _solver_options(options: str) -> str:

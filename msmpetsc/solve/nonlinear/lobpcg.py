@@ -136,7 +136,8 @@ class Lobpcg:
                 break
             least_its = 2 if lowest[-1] < 0 else max(least, 1)
             fall = lowest[its // 2] - lowest[-1]
-            if its >= least_its and fall <= UNCHANGED * abs(lowest[-1]):
+            # The eigenvalue may be infinite or NaN
+            if its >= least_its and not fall > UNCHANGED * abs(lowest[-1]):
                 break
         return ritz[0], ritz[1].copy()
 

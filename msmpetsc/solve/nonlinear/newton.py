@@ -21,7 +21,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from msmpetsc.backend.arrays import Array
+from msmpetsc.backend.arrays import Array, Positions
 from msmpetsc.comm import reduced
 from msmpetsc.solve.nonlinear.curvature import Alarm
 from msmpetsc.solve.nonlinear.error_control import Outcome
@@ -247,7 +247,7 @@ class Newton(StepMethod):
         Return None if no step along y lowers g.
         """
         lower, bent = None, self._bent(now)
-        if bent:
+        if bent is not None:
             lower = self._search(now, bent, 1.0, flat)
             self.functional.vectors.give_back(bent)
         lower = lower or self._search(now, self.y, SHORTEST, flat)
@@ -280,25 +280,27 @@ class Newton(StepMethod):
         """Shorten y so that the surface crosses nothing."""
         if self.functional.surface is None:
             return
-        self.end.waxpy(-1.0, y, now.x)
         with LOCAL:
-            end = self.functional.positions(self.end)
-            share = self.functional.collision_free_step(now.q, end)
+            share = self.functional.collision_free_step(now.q, self._end(now, y))
         if share < 1.0:
             y.scale(share)
+
+    def _end(self, now: Iterate, y: PETSc.Vec) -> Positions:
+        """Return the positions (l, 3) [m] at x - y."""
+        self.end.waxpy(-1.0, y, now.x)
+        return self.functional.positions(self.end)
 
     def _bent(self, now: Iterate) -> PETSc.Vec | None:
         """Return y bent so that nodes stop at obstacles that they would enter; None if none would.
 
         H at x lacks obstacles that nodes do not touch yet. If the line search shortened the whole
-        step for these nodes, they would come into contact one by one.
+        step for these nodes, each iteration would bring few nodes into contact.
         """
-        if now.contact is None:
+        if now.contact is None or not now.contact.step.states:
             return None
         functional = self.functional
-        self.end.waxpy(-1.0, self.y, now.x)
         with LOCAL:
-            end = functional.positions(self.end)
+            end = self._end(now, self.y)
             stopped = now.contact.stopped(end)
         if not reduced(functional.comm, stopped is not None, MPI.LOR):
             return None

@@ -147,7 +147,7 @@ PRESETS = {
 }
 
 
-# type option -> option that fits only the preset's type; a user's type drops it
+# type option -> option that fits only the preset's type; another type drops it
 BOUND_TO_TYPE = {"pc_type": "pc_factor_mat_solver_type", "ksp_type": "ksp_norm_type"}
 # SNES types that solve with the Jacobian and take no nonlinear preconditioner
 SOLVE_THEMSELVES = {"newtonls", "newtontr", "ksponly", "vinewtonrsls", "vinewtonssls"}
@@ -223,9 +223,13 @@ class SolverOptions:
         }
         database = PETSc.Options()
         given = [name for name in database.getAll() if name.startswith(prefix) and not in_use[name]]
-        users = {name.removeprefix(prefix) for name in given}
-        bound = {BOUND_TO_TYPE[name] for name in BOUND_TO_TYPE.keys() & users}
-        ours = options.keys() - users - bound
+        users = {name.removeprefix(prefix): database.getString(name) for name in given}
+        unfit = {
+            bound
+            for name, bound in BOUND_TO_TYPE.items()
+            if users.get(name, options.get(name)) != options.get(name)
+        }
+        ours = options.keys() - users.keys() - unfit
         if database.getString(f"{prefix}snes_type", "") in SOLVE_THEMSELVES:
             ours -= {name for name in ours if name.startswith("npc_")} | {"snes_npc_side"}
         for name in ours:

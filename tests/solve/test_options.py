@@ -371,3 +371,13 @@ def test_a_misspelt_type_of_solver_is_named_with_the_nearest(
     name, value = option.split("=")
     words = ["run", block_scene(tmp_path, **SCENE), "-o", tmp_path / "o.h5", f"-{name}", value]
     assert f"{value}, did you mean {wanted!r}?" in command_error(*words)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_preset_s_own_option_given_changes_nothing(petsc_options, preset: str):
+    solvers = {"": (find_preset(preset), 0)}
+    before = shown_options(solvers)
+    for name in ("ksp_type", "pc_type"):
+        if value := PRESETS[preset].options.get(name):
+            petsc_options(**{name: value})
+    assert shown_options(solvers) == before

@@ -167,6 +167,20 @@ def test_a_fall_is_a_few_long_steps_and_an_impact_many_short_ones(tmp_path: Path
     assert frames[-1].momentum[2] > 0
 
 
+def test_a_body_at_rest_takes_no_short_steps(tmp_path: Path):
+    """Rounding alone moves a turned beam until a force acts."""
+    turned = {"rotate": {"axis": [1, 2, 3], "degrees": 30}}
+    region = {"box": [[0.8, -0.1, -0.1], [1.1, 1.1, 1.1]], "relative": True}
+    tables = {
+        "mesh": {"source": "scene.ply", "prepare": [turned]},
+        "force": [{"region": region, "total": [0, 0, -100.0], "start": 3 * STEP}],
+        "gravity": {"acceleration": [0, 0, 0]},
+    }
+    _, frames = play(beam(tmp_path, duration=6 * STEP, error=3e-2, **tables))
+    assert [frame.steps for frame in frames[1:4]] == [1, 1, 1]
+    assert frames[3].time_error == 0 < frames[-1].time_error < 3e-2
+
+
 @pytest.mark.parametrize("stop", [0.1, 0.115])
 def test_no_step_crosses_the_time_an_anchor_lets_go(tmp_path: Path, stop: float):
     """At the time of release the nodes are still at the anchor's positions.

@@ -388,6 +388,9 @@ class Adaptive(Integrator):
             # trial, an implicit step, limits it.
             self.coming = min(self.coming, coming)
             motion = max(motion, self.coming)
+            # Rounding is no motion, so its error counts as 0.
+            if motion * self.mass <= result.moved_by_rounding**2:
+                return Measure(0.0, 0.0)
         return Measure(math.sqrt(error) + late, math.sqrt(motion))
 
     def _accepted(

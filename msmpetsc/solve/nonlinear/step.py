@@ -62,6 +62,7 @@ class StepResult:
     contact      : contact at ``position``; None without contact, or if explicit
     problem      : F = M (x - y) + tau^2 (grad E - f_ext), without M in statics; None if explicit
     energy_tolerance : energy [J]; if g / tau^2 is this close to its minimum, x meets the error
+    moved_by_rounding : greatest displacement by rounding, in the norm of M [m sqrt(kg)]
     load         : external forces of the problem; None if explicit or static
     tau          : tau of the problem [s]
     viscous      : gradient of the dissipation potential D (owned, 3) [N]; None without viscosity
@@ -83,6 +84,7 @@ class StepResult:
     problem: StepProblem | None = None
     load: ExternalForces | None = None
     energy_tolerance: float = 0.0
+    moved_by_rounding: float = 0.0
     tau: float = np.inf
     viscous: Rows | None = None
     viscous_work: float = 0.0
@@ -244,6 +246,7 @@ class Stepper:
             return StepResult(
                 now.q, problem.q, cost,
                 contact=now.contact, problem=problem, energy_tolerance=energy_tolerance,
+                moved_by_rounding=self.control.rounding.displacement,
             )  # fmt: skip
 
     def _begin(self, problem: StepProblem, start: Rows | None) -> Iterate:

@@ -17,9 +17,14 @@ from nowhere. If nodes rebound after the solve, their energy enters the balance 
 because the next step dissipates most of it.
 
 For Verlet, W is the work of anchors, moving obstacles and f_ext in the substeps. Therefore f is
-absent, q'_n is q_n, and C is taken at the start of the step. The energy of Verlet and BDF2
-oscillates, so a step may regain a limited share of earlier losses. In a linear body, the energy of
-Verlet with substeps dt oscillates by
+absent, q'_n is q_n, and C is taken at the start of the step.
+
+BDF2 spreads the impulse of an obstacle over several steps, so W may lack its work. Therefore a step
+of BDF2 gains the lesser of the gains in a frame at rest and in a frame that moves with the
+obstacles.
+
+The energy of Verlet and BDF2 oscillates, so a step may regain a limited share of earlier losses. In
+a linear body, the energy of Verlet with substeps dt oscillates by
 
     dt^2/8 |M^(-1) (f_ext - grad E)|_M^2
 
@@ -164,13 +169,17 @@ class EnergyBalance:
         if result.static:
             return replace(after, budget=before.budget), False
         step = SolvedStep(before, result, after, time, time_step)
-        sums = self._start(step)
+        sums, gains = self._start(step), False
+        if self.swings and not result.explicit:
+            gained, there = self._gained_beside_obstacles(step, sums)
+            gains = before.history is not None and gained > NOTABLE_GAIN * max(there, self.floor)
+            # W may lack the work of obstacles.
+            sums[2] += max(self.energies.inner - sums[0] - sums[2] - gained, 0.0)
         budget = self._budget_after(step, sums)
-        gains = before.history is not None and self._history_gains(step, sums)
         return replace(after, budget=budget), gains
 
-    def _history_gains(self, step: SolvedStep, resting: Floats) -> bool:
-        """Return whether a solved step gains more than NOTABLE_GAIN of all energy (collective).
+    def _gained_beside_obstacles(self, step: SolvedStep, resting: Floats) -> tuple[float, float]:
+        """Return the energy [J] that a solved step gains, and all energy before it (collective).
 
         Energy and work are counted in a frame that moves with the obstacles that press at the start
         or the end of the step. In any other frame these obstacles do work. If no obstacle presses,
@@ -205,8 +214,7 @@ class EnergyBalance:
         # Impacts follow the solve, so the next step starts with their energy.
         start, _, work, _, _ = self._start(step, frame) if frame.any() else resting
         ended = self.energies.inner - momentum @ frame + 0.5 * mass * frame @ frame
-        gained = ended - start - work
-        return bool(gained > NOTABLE_GAIN * max(start + max(work, 0.0), self.floor))
+        return float(ended - start - work), float(start + max(work, 0.0))
 
     def _budget_after(self, step: SolvedStep, sums: Floats) -> EnergyBudget:
         """Return the energy budget after a step (collective). Raises StepFailed.

@@ -89,6 +89,16 @@ def test_a_block_comes_to_rest_on_a_floor_that_carries_its_weight(tmp_path: Path
     assert sum(frame.iterations for frame in frames[-10:]) < 32
 
 
+def test_a_plate_that_throws_a_block_gives_no_energy_from_nowhere(tmp_path: Path):
+    """BDF2 spreads the plate's impulse over steps, in which the plate does no work."""
+    plate = FLOOR | {"path": [{"time": 0.1, "by": [0, 0, 0.05]}]}
+    time = {"step": 0.01, "duration": 0.1, "integrator": "bdf2"}
+    scene = fine_block(tmp_path, time=time, obstacle=[plate], material=solid_of(1e5, 0.25))
+    _, frames = play(scene)
+    assert frames[-1].kinetic > 0
+    assert sum(frame.energy_gained for frame in frames) < 1e-3 * frames[-1].kinetic
+
+
 def test_frames_within_long_adaptive_steps_have_the_force_of_a_floor(tmp_path: Path):
     time = {"step": 0.02, "duration": 1.0, "error": 0.5}
     scene = fine_block(tmp_path, time=time, obstacle=[FLOOR], gravity=GRAVITY)

@@ -122,6 +122,13 @@ def test_a_scene_too_large_to_build_is_scaled_and_says_so(scene: Path, capsys, m
     assert int(cells) == pytest.approx(volume / 0.02**3, rel=0.1)
 
 
+@pytest.mark.parametrize(("preset", "factors"), [("fast-msm", True), ("lbfgs", False)])
+def test_a_factor_that_the_memory_lacks_is_told(scene: Path, capsys, preset: str, factors: bool):
+    assert status_of("inspect", scene, "--set", f"solver.preset={preset}") == 0
+    words = f"the memory lacks the Cholesky factor of {preset}"
+    assert (words in capsys.readouterr().err) == factors
+
+
 @pytest.mark.parametrize("most", [MOST_BUILT, 100])
 @pytest.mark.parametrize(
     ("law", "cages", "bending"),

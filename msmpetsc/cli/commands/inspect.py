@@ -122,9 +122,15 @@ def memory_of(
     # PETSc must get its options before it is imported
     from msmpetsc.solve.presets import find_preset
 
+    preset = find_preset(scene.solver.preset)
     of_node = OF_SPRINGS if scene.material.law == "linear" else OF_SOLID
-    if not find_preset(scene.solver.preset).true_hessian:
+    if not preset.true_hessian:
         of_node = WITH_A
+    if preset.options.get("pc_type") == "cholesky":
+        log.warning(
+            "the memory lacks the Cholesky factor of %s, which grows faster than the nodes",
+            scene.solver.preset,
+        )
     step = of_node * (partition.nodes + partition.ghosts)
     points = sum(len(surface.points) for surface in surfaces)
     needed: Floats = PROGRAM + np.maximum(step, BYTES_OF_POINT * points / len(step))

@@ -43,6 +43,12 @@ def test_free_flight_decays_by_each_schemes_own_formula(tmp_path: Path):
     )
 
 
+def test_a_flight_without_strain_ends_no_step_far_off(tmp_path: Path, caplog):
+    """Rounding alone strains the body, and moves it beside its flight."""
+    velocities(damped(tmp_path, "bdf2", 320, step=1 / 320, start={"velocity": SPEED}))
+    assert "off its solution" not in caplog.text
+
+
 @pytest.mark.parametrize("gravity", [0.0, -9.81], ids=["free", "falling"])
 def test_bdf2_converges_to_the_exponential_with_second_order(tmp_path: Path, gravity: float):
     errors, limit = [], gravity / ALPHA
@@ -103,6 +109,23 @@ def test_a_solid_of_kelvin_and_voigt_creeps(tmp_path: Path, integrator: str):
     given = np.array(moved[:-1]) / moved[-1]
     expected = 1 - np.exp(-np.array([frame.time for frame in frames]) / RETARDATION)
     assert np.abs(given - expected).max() < 0.03 and abs(given[-1] - expected[-1]) < 0.002
+
+
+@pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
+@pytest.mark.parametrize("loss", [{"retardation_time": 0.01}, {"damping": 1000.0}])
+def test_a_start_that_losses_stop_at_once_gives_no_energy(
+    tmp_path: Path, integrator: str, loss: dict[str, float]
+):
+    """BDF2 led a held body half a step's way on, to six times the energy of its start."""
+    scene = block_scene(
+        tmp_path,
+        time={"step": 0.01, "duration": 0.03, "integrator": integrator},
+        material=solid_of(1e7) | loss,
+        pin=[{"region": FOOT}],
+        start={"velocity": [1.0, 0.0, 0.0]},
+    )
+    energy = [frame.kinetic + frame.elastic for frame in play(scene)[1]]
+    assert (np.diff(energy) < 0).all()
 
 
 def test_viscosity_does_not_brake_a_spin(tmp_path: Path):

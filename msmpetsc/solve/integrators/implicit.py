@@ -297,11 +297,15 @@ class ImplicitEuler(Integrator):
         anchors = self.environment.anchors.acting(time)
         if len(anchors) < len(self.anchors):
             self.anchors = anchors
-            self.destroy()
             # Begin with the first tau, because a resumed run does not know the old tau.
-            self.tau = self._first_tau()
-            self.stepper = self._new_stepper(time)
-            self.set_up()
+            self._renew(self._first_tau(), time)
+
+    def _renew(self, tau: float, time: float) -> None:
+        """Make a new solver for a tau [s] and the nodes free at a time [s] (collective)."""
+        self.destroy()
+        self.tau = tau
+        self.stepper = self._new_stepper(time)
+        self.set_up()
 
     def save(self, checkpoint: Checkpoint) -> None:
         # Before the first step the solver has nothing to forget.
@@ -348,6 +352,8 @@ class Bdf2(ImplicitEuler):
         new velocity and with the node's present acceleration. Without this acceleration, an impact
         would add energy.
         """
+        if state.history is None and self.retardation:
+            return self._first_of_viscous(state, time)
         self._let_go(time)
         q, v, work_before = state.q, state.velocity(self.time_step), Work()
         begin, forces = time - self.time_step, self.environment.forces
@@ -375,12 +381,35 @@ class Bdf2(ImplicitEuler):
         )
         cost = replace(work_before + result.cost, step_error=result.cost.step_error, steps=1)
         result = replace(result, previous=previous, cost=cost, work=work, begun_error=begun_error)
-        if before is not previous:
-            struck = (before != previous).any(axis=1)[:, None]
-            v_after = (result.position - before - a) / self.time_step
-            q = np.where(struck, before + 0.5 * a, q)
-            v = np.where(struck, v_after, v)
-        return result, State(result.position, before, (q, v), sides)
+        after = State(result.position, before, (q, v), sides)
+        return result, self._with_rebounds(after, previous, a)
+
+    def _with_rebounds(self, after: State, previous: Positions, a: Rows | float) -> State:
+        """Return the state after a step with a history of rebounding nodes that leads to the state.
+
+        previous : (l, 3) positions whose differences from ``after.q_previous`` tell rebounds [m]
+        a        : (l, 3) acceleration in the step times t^2 [m]
+        """
+        assert after.history is not None
+        (q, v), before = after.history, after.q_previous
+        struck = (before != previous).any(axis=1)[:, None]
+        v_after = (after.q - before - a) / self.time_step
+        history = np.where(struck, before + 0.5 * a, q), np.where(struck, v_after, v)
+        return replace(after, history=history)
+
+    def _first_of_viscous(self, state: State, time: float) -> tuple[StepResult, State]:
+        """Take a viscous body's step without history by implicit Euler (collective).
+
+        Viscosity may stop a motion within a small part of a step. A history with the mean
+        acceleration of this part would lead the body far on.
+
+        Raises StepFailed.
+        """
+        self._renew(self.time_step, time)
+        result, after = super().advance(state, time)
+        self._renew(self._first_tau(), time)
+        history = state.q, state.velocity(self.time_step)
+        return result, self._with_rebounds(replace(after, history=history), result.previous, 0.0)
 
     def _history(
         self, state: State, load: ExternalForces, time: float
@@ -388,8 +417,10 @@ class Bdf2(ImplicitEuler):
         """Return a history for a state without history, the velocities, the error, and the work.
 
         The history leads to q and v with the acceleration a of an implicit Euler step of length
-        tau. The error of this acceleration is of first order. Held components have the velocity of
-        their path, and no acceleration.
+        tau. The error of this acceleration is of first order. Damping may stop a motion within a
+        small part of the step. Therefore q_0 has the velocity at the step's end, and the part of a
+        that strong damping leaves. Held components have the velocity of their path, and no
+        acceleration.
 
         A mode of frequency w has a = a_n / (1 + (tau w)^2), with the acceleration a_n at q. The
         BDF2 step then moves it as if its acceleration were constant. The error [m sqrt(kg)] is
@@ -401,8 +432,8 @@ class Bdf2(ImplicitEuler):
         v_end = (result.position - q) / tau
         v = np.where(self.stepper.lattice.fixed, v_end, v)
         a = (v_end - v) / tau
-        history = q - t * v + t**2 / 2 * a, v - t * a
-        return history, v, self._begun_error(result), result.cost
+        q_0 = q - t * v_end + t * (t / 2 + tau) / (1 + self.damping * tau) * a
+        return (q_0, v - t * a), v, self._begun_error(result), result.cost
 
     def _begun_error(self, result: StepResult) -> float:
         """Return the error [m sqrt(kg)] of the history that ``_history`` makes from a result."""

@@ -29,6 +29,8 @@ from msmpetsc.solve.petsc.events import CONTACT, ENERGY, GRADIENT
 ROUNDINGS = 3 * np.finfo(float).eps
 # Greatest displacement by rounding that is negligible [body's size]
 NEGLIGIBLE = 1e-6
+# Rounding of y, a sum of positions of earlier steps [rounding of x]
+OF_HISTORY = 10.0
 # Displacement by a load beyond which no digits of the body's shape are left [body's
 # greatest coordinate]
 FARTHEST = 1e6
@@ -355,6 +357,6 @@ class Rounding:
         if is_rounding and away < error * away <= NEGLIGIBLE * size:
             # The body is at rest
             moved = error * away
-        if not away > moved:
+        if not away > OF_HISTORY * moved:
             return moved / max(size, sys.float_info.min)
         return max(error, moved / away)

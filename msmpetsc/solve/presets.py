@@ -222,8 +222,11 @@ class SolverOptions:
             "snes_max_it": str(max(int(preset.options["snes_max_it"]), budget))
         }
         database = PETSc.Options()
-        given = [name for name in database.getAll() if name.startswith(prefix) and not in_use[name]]
-        users = {name.removeprefix(prefix): database.getString(name) for name in given}
+        users = {
+            name.removeprefix(prefix): value
+            for name, value in database.getAll().items()
+            if name.startswith(prefix) and not in_use[name]
+        }
         unfit = {
             bound
             for name, bound in BOUND_TO_TYPE.items()

@@ -290,6 +290,22 @@ def test_a_profile_is_the_share_within_each_factor():
     assert steps["anderson"] == [(1, 0.4), (3, 0.6), (right, 0.6)]
 
 
+@pytest.mark.parametrize("other, titles", [
+    ("newton-multigrid", ["by seconds", "by products with the Hessian"]),
+    ("fast-msm", ["by seconds"]),
+])  # fmt: skip
+def test_a_profile_compares_products_of_methods_with_a_hessian_alone(other, titles):
+    """The preset fast-msm solves with A: 300 solves a step count as a few products."""
+    rows = [
+        row_of(label, error=1e-3, cells=cells, time_frame=1.0, products=5)
+        for label in ("newton", other)
+        for cells in (1000, 2000, 3000)
+    ]
+    table = as_table(rows)
+    (chart,) = profile_charts(table, curve_styles(table["label"]))
+    assert [panel.title for panel in chart.panels] == titles
+
+
 def test_a_profile_needs_three_problems_with_the_same_methods():
     table = as_table([row for row in profiled() if row["cells"] in ("1000", "2000")])
     assert not profile_charts(table, curve_styles(table["label"]))

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 from pandas import DataFrame
 
+from msmpetsc.solve.presets import PRESETS
 from msmpetsc.study.charts.plot import Chart, Styles, channel
 from msmpetsc.study.table import measured, succeeded
 
@@ -25,6 +26,8 @@ PROBLEM = ["scene", "time_step", "error", "cells"]
 FEWEST = 3
 # title of a panel by its column
 COSTS = {"time_frame": "seconds", "products": "products with the Hessian"}
+# presets whose solves with the constant matrix A are no products
+WITHOUT_HESSIAN = [name for name, preset in PRESETS.items() if not preset.true_hessian]
 
 
 def profile_charts(table: DataFrame, styles: Styles) -> list[Chart]:
@@ -76,11 +79,17 @@ def ratios(problems: list[DataFrame], cost: str) -> DataFrame:
 
 
 def profile_chart(name: str, problems: list[DataFrame], styles: Styles) -> Chart:
-    """Return the chart of problems, with a panel for each cost that was measured."""
+    """Return the chart of problems, with a panel for each cost that was measured.
+
+    Products are left out if a method solves with the constant matrix A, because they miss its work.
+    """
     labels = dict.fromkeys(label for rows in problems for label in rows["label"])
     own = {label: styles[label] for label in labels}
     chart = Chart(name, PROFILE, f"{PROFILE}: {len(problems)} problems", CAPTION, own, columns=2)
-    for cost, title in COSTS.items():
+    costs = dict(COSTS)
+    if any(rows["preset"].isin(WITHOUT_HESSIAN).any() for rows in problems):
+        del costs["products"]
+    for cost, title in costs.items():
         factors = ratios(problems, cost)
         if np.isfinite(factors).any(axis=None):
             draw_profile(chart, title, factors)

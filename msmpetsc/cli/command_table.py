@@ -133,7 +133,8 @@ RENDER = (
     argument("--eye", metavar="X,Y,Z", help="direction from the body to the eye (--eye=-1,2,0.5)"),
     argument(
         "--size", metavar="WxH",
-        help="size of a film (960x720), or largest size of a panel (460x1000) [px]",
+        help="size of a film with its caption (default: a view of up to 960x960), or largest size "
+        "of a panel without (400x870, of a scene 760x900) [px]",
     ),
     argument(
         "--colour", metavar="FIELD",

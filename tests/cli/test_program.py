@@ -18,8 +18,9 @@ import msmpetsc
 from msmpetsc.backend import kernel_cache
 from msmpetsc.cli import main as program
 from msmpetsc.cli.command_table import COMMANDS
-from msmpetsc.cli.commands import doctor
+from msmpetsc.cli.commands import doctor, render
 from msmpetsc.cli.main import parsed
+from msmpetsc.view import film, sheet
 
 ONCE = {"step": 0.01, "duration": 0.01}
 
@@ -35,6 +36,14 @@ def test_every_command_has_examples_that_are_command_lines(capsys):
         assert all(f"\n  {example}\n" in shown for example in command.examples), (
             "the lines are kept whole"
         )
+
+
+def test_the_help_of_render_names_the_default_sizes(capsys):
+    with pytest.raises(SystemExit):
+        parsed(["render", "--help"])
+    shown = capsys.readouterr().out
+    sizes = [(film.LONGEST, film.LONGEST), sheet.PANEL, render.STILL]
+    assert all(f"{width}x{height}" in shown for width, height in sizes)
 
 
 def test_an_interrupt_is_not_lost_in_an_import(monkeypatch, capsys):

@@ -1,5 +1,6 @@
 """msmpetsc compare: its errors by their formulas, and the first frame and node that differ."""
 
+import json
 import re
 from pathlib import Path
 
@@ -101,6 +102,9 @@ def test_nan_equals_nan_and_nothing_else(a: Path, tmp_path: Path, capsys):
     assert told(capsys, nan, nan)[0] == 0
     status, out, _ = told(capsys, a, nan)
     assert status == 1 and "from frame 1 on" in out and " inf " in out
+    shown = json.loads(told(capsys, a, nan, "--json")[1], parse_constant=pytest.fail)
+    assert shown["fields"]["elastic"]["error"] is None
+    assert shown["fields"]["elastic"]["first_above"] == 1
     pairs = [(np.nan, np.nan), (np.nan, 1), (np.inf, np.inf), (np.inf, -np.inf), (1, np.inf)]
     assert difference(*np.transpose(pairs)).tolist() == [0, np.inf, 0, np.inf, np.inf]
 

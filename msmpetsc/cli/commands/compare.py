@@ -39,7 +39,7 @@ def run(args: argparse.Namespace) -> int:
                 "agree": agree,
                 "rtol": args.rtol,
                 "frames": frames,
-                "fields": fields,
+                "fields": {name: field | for_json(field) for name, field in fields.items()},
                 "left_out": list(comparison.left_out),
                 "notes": notes,
             }
@@ -82,6 +82,11 @@ def record(field: FieldError, comparison: Comparison, rtol: float) -> dict[str, 
         "scale": float(field.scale),
         "unit": field.unit,
     }
+
+
+def for_json(field: dict[str, Any]) -> dict[str, None]:
+    """Return null for the values of a field that are not finite, for which JSON has no number."""
+    return {key: None for key in ("error", "scale") if not np.isfinite(field[key])}
 
 
 def row(name: str, field: dict[str, Any]) -> str:

@@ -107,7 +107,8 @@ def _around(cages: Cages, keys: Indices) -> tuple[Mask, Indices]:
     copies = cells[rows, :, None] + np.arange(COPIES)
     own, corners = cages.copies.corner_keys(keys[rows]), cages.copies.corner_keys(copies)
     joined = (corners[..., None] == own[:, None, None, None, :]).any(axis=(3, 4))
-    joined &= cages.table.find(copies) >= 0
+    # a cell outside the grid has the key -1, and -1 + 1 is the key of the first cell
+    joined &= (cages.table.find(copies) >= 0) & (cells[rows] >= 0)[..., None]
     joined[:, MIDDLE] = copies[:, MIDDLE] == keys[rows, None]
     neighbours[rows] = joined.sum(axis=2) == 1
     # the cell itself comes last, so that its own corners count

@@ -150,6 +150,19 @@ def test_copies_share_corners_at_the_end_of_the_slit_alone():
         assert len(shared) == (4 if i == BASE else 0)
 
 
+@pytest.mark.parametrize("kind", ["affine", "cages"])
+def test_points_beside_a_slit_at_the_first_cell_keep_their_places(kind: str):
+    """Cells outside the grid have no corner in common with the first cell."""
+    turned = fork(0.3, shift=1.0)
+    turned.apply_transform(trimesh.transformations.rotation_matrix(np.pi, [0, 0, 1]))
+    body = body_of(turned)
+    cages = fill([body], H)
+    net = topology_of(cages)
+    weights = embed([body.surface.points], cages, net.table, kind)
+    nodes = cages.grids.node_positions(net.ijk)
+    np.testing.assert_allclose(weights @ nodes, body.surface.points, atol=1e-9)
+
+
 def test_the_surface_follows_its_own_part(tmp_path: Path):
     """If one side of the slit moves, the points of its own wall move along."""
     body = body_of(fork(0.3))

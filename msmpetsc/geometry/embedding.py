@@ -112,7 +112,7 @@ def _around(cages: Cages, keys: Indices) -> tuple[Mask, Indices]:
     joined[:, MIDDLE] = copies[:, MIDDLE] == keys[rows, None]
     neighbours[rows] = joined.sum(axis=2) == 1
     # the cell itself comes last, so that its own corners count
-    for cell in np.roll(np.arange(27), 26 - MIDDLE):
+    for cell in np.argsort(-np.abs(CELLS_AROUND).sum(axis=1), kind="stable"):
         row, copy = np.nonzero(joined[:, cell] & neighbours[rows, cell, None])
         place = (CELLS_AROUND[cell] + CORNERS + 1) @ NODE_STRIDE
         node_keys[rows[row][:, None], place] = corners[row, cell, copy]

@@ -163,6 +163,29 @@ def test_points_beside_a_slit_at_the_first_cell_keep_their_places(kind: str):
     np.testing.assert_allclose(weights @ nodes, body.surface.points, atol=1e-9)
 
 
+def test_the_end_of_a_slit_follows_its_sides_alike_along_all_axes():
+    """Points below the prongs follow nodes of the prong on their own side, whatever the order."""
+    prongs = trimesh.boolean.difference(
+        [box([0, 0, 0], [4, 2, 4]), box([1.4, -1, 1.2], [2.6, 3, 5])], engine="manifold"
+    )
+    prongs.apply_scale(H)
+    followed = []
+    for turn in range(3):
+        across, up = turn, (2 + turn) % 3
+        body = body_of(trimesh.Trimesh(np.roll(prongs.vertices, turn, axis=1), prongs.faces))
+        cages = fill([body], H)
+        net = topology_of(cages)
+        ijk = decode_morton(net.keys)
+        left, right = (
+            np.isin(np.arange(len(net.ijk)), net.cells[(ijk[:, up] > 1) & is_on_side])
+            for is_on_side in (ijk[:, across] < 2, ijk[:, across] > 1)
+        )
+        weights = embed([body.surface.points], cages, net.table, "affine")
+        side = (right * 1.0 - left) * (net.ijk[:, up] > 2)
+        followed.append(weights @ side)
+    np.testing.assert_allclose(followed, followed[:1] * 3, atol=1e-12)
+
+
 def test_the_surface_follows_its_own_part(tmp_path: Path):
     """If one side of the slit moves, the points of its own wall move along."""
     body = body_of(fork(0.3))

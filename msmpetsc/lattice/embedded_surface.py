@@ -16,7 +16,7 @@ from msmpetsc.comm import Route, on_root
 from msmpetsc.errors import InputError
 from msmpetsc.geometry.embedding import embed
 from msmpetsc.geometry.grid import MOST_ON_PLANE
-from msmpetsc.geometry.surface import Surface, compact, first_of_equal, have_three_corners
+from msmpetsc.geometry.surface import SINGLE, Surface, compact, first_of_equal, have_three_corners
 from msmpetsc.lattice.lattice import Lattice
 from msmpetsc.lattice.region import Finder, groups_named
 from msmpetsc.scene.motion import Pressure
@@ -113,7 +113,8 @@ def _refined(surface: Surface, longest: float) -> Surface:
             ends[0] * len(points) + ends[1], return_index=True, return_inverse=True
         )
         low, high = points[ends.reshape(2, -1)[:, first]]
-        is_long = np.linalg.norm(high - low, axis=1) > longest
+        # equal edges are halved alike, wherever the body lies
+        is_long = np.linalg.norm(high - low, axis=1) > longest * (1 + SINGLE)
         if not is_long.any():
             break
         middle = len(points) + np.cumsum(is_long) - 1

@@ -49,6 +49,19 @@ def pressed_block(folder: Path, **tables) -> Path:
     )  # fmt: skip
 
 
+def test_a_load_is_the_same_wherever_the_body_lies(tmp_path: Path):
+    """Edges of exactly half a cell are never halved, whatever their rounding."""
+    shares = []
+    for x in (0.25, 0.1, 0.3, 5.3):
+        place = {"source": "scene.ply", "base": [x, x, x]}
+        moved = block_scene(
+            tmp_path, material=SOLID, mesh=place, time=STATIC, pin=[{"region": ALL, "fix": ["x"]}],
+            traction=[{"region": ALL, "value": [0, 1, 0]}],
+        )  # fmt: skip
+        shares.append(model_of(moved).loads[-1].share)
+    np.testing.assert_allclose(shares, shares[:1] * 4, rtol=1e-9)
+
+
 def test_a_closed_pressure_has_the_potential_p_times_volume(tmp_path: Path):
     model = model_of(pressed_block(tmp_path))
     (part,), rest = model.lattice.pressed, model.lattice.nodes

@@ -150,6 +150,23 @@ def test_viscosity_does_not_brake_a_spin(tmp_path: Path):
 
 
 @pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
+def test_a_viscous_body_bends_alike_at_rest_and_in_uniform_motion(tmp_path: Path, integrator: str):
+    """An anchor and the body move at 8 m/s, a whole cell in a step, or stay in place."""
+    ends = []
+    for speed in (0.0, 8.0):
+        moving = {
+            "start": {"velocity": [0, 0, speed], "spin": [0, 3.0, 0]},
+            "anchor": [
+                {"region": {"box": [[-1, -1, -1], [0.01, 1, 1]]}}
+                | {"path": [{"time": 1.0, "by": [0, 0, speed]}]}
+            ],
+        }
+        _, frames = play(viscous(tmp_path, integrator, STEP, 5 * STEP, RETARDATION, **moving))
+        ends.append(frames[-1].position - [0, 0, speed * frames[-1].time])
+    np.testing.assert_allclose(*ends, atol=1e-9)
+
+
+@pytest.mark.parametrize("integrator", ["implicit-euler", "bdf2"])
 def test_a_body_that_an_anchor_leads_as_it_flies_is_not_strained(tmp_path: Path, integrator: str):
     """Anchored nodes move as the body flies.
 

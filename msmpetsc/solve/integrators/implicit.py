@@ -198,7 +198,7 @@ class ImplicitEuler(Integrator):
         return duration / (1 + self.damping * duration)
 
     def _rates(
-        self, q: Positions, y: Positions, q_before: Positions | None
+        self, problem: StepProblem, q_before: Positions | None
     ) -> tuple[Positions, Positions] | None:
         """Return x^ of a viscous solid and the positions that rotate its K, (l, 3) [m] each.
 
@@ -206,9 +206,12 @@ class ImplicitEuler(Integrator):
         """
         if not self.retardation:
             return None
+        q, fixed = problem.q, self.stepper.lattice.fixed
+        # y lacks the motion that an anchor begins in this step
+        end = np.where(fixed, problem.fixed_positions, problem.y)
         if q_before is None:
-            return q, 0.5 * (q + y)
-        return (4 * q - q_before) / 3, y
+            return q, 0.5 * (q + end)
+        return (4 * q - q_before) / 3, end
 
     def set_up(self) -> None:
         """Build the preconditioner (collective). Raises InputError if PETSc lacks it."""
@@ -252,9 +255,10 @@ class ImplicitEuler(Integrator):
             self.environment, state.q, y, load, time, time_step, state.sides, fixed, q_before
         )
         work_before = self.stepper.work_so_far()
-        rates = self._rates(state.q, y, q_before)
         result = faces.solve(
-            lambda whole: self.stepper.step(replace(whole, rates=rates), faces.start)
+            lambda whole: self.stepper.step(
+                replace(whole, rates=self._rates(whole, q_before)), faces.start
+            )
         )
         self.environment.end_step(result.contact)
         cost = replace(

@@ -394,7 +394,8 @@ class Bdf2(ImplicitEuler):
         previous : (l, 3) positions whose differences from ``after.q_previous`` tell rebounds [m]
         a        : (l, 3) acceleration in the step times t^2 [m]
         """
-        assert after.history is not None
+        if after.history is None or after.q_previous is previous:
+            return after
         (q, v), before = after.history, after.q_previous
         struck = (before != previous).any(axis=1)[:, None]
         v_after = (after.q - before - a) / self.time_step

@@ -111,7 +111,7 @@ def _around(cages: Cages, keys: Indices) -> tuple[Mask, Indices]:
     joined &= (cages.table.find(copies) >= 0) & (cells[rows] >= 0)[..., None]
     joined[:, MIDDLE] = copies[:, MIDDLE] == keys[rows, None]
     neighbours[rows] = joined.sum(axis=2) == 1
-    # cells that share a face come late, and the cell itself last, so that these corners count
+    # cells that share a face come late, and the cell itself last: their corners count
     for cell in np.argsort(-np.abs(CELLS_AROUND).sum(axis=1), kind="stable"):
         row, copy = np.nonzero(joined[:, cell] & neighbours[rows, cell, None])
         place = (CELLS_AROUND[cell] + CORNERS + 1) @ NODE_STRIDE

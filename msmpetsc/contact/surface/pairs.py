@@ -20,11 +20,10 @@ from msmpetsc.contact.surface.creases import NEAREST
 from msmpetsc.contact.surface.points import SurfacePoints
 from msmpetsc.geometry.surface import Surface
 
-# Margin of candidate pairs: displacement of a point before a new broad phase [mean
-# edges]; a smaller margin does not give fewer pairs, 0.25 gives four times as many
+# Margin of candidate pairs: displacement of a point before a new broad phase, or in a
+# narrow step [mean edges]; a smaller margin does not give fewer pairs, 0.25 gives four
+# times as many
 REACH = 0.02
-# Margin of candidate pairs in a narrow step [mean edges]
-FARTHEST = 0.05
 # Share of points in contact from which second solves cost more than narrow steps save
 # [-]
 FEW = 0.01
@@ -199,7 +198,7 @@ class ContactSearch:
         if self.is_narrow and not self.is_left_out:
             points = self.points(pairs.q, self.time)
             if self.barrier:
-                self._around = self.barrier.around(touched, points, FARTHEST * self.edge)
+                self._around = self.barrier.around(touched, points, REACH * self.edge)
 
     def widen(self) -> None:
         """Use all candidates from now on."""

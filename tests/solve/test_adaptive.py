@@ -4,7 +4,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from block_scene import CLAMP, GRAVITY, block_scene, clamped_beam, plane_at, play, solid_of
+from block_scene import (
+    CLAMP,
+    GRAVITY,
+    G,
+    block_scene,
+    clamped_beam,
+    half_space,
+    plane_at,
+    play,
+    solid_of,
+)
 from failing_steps import Failing
 from one_process import input_error
 
@@ -198,6 +208,23 @@ def test_no_step_crosses_the_time_an_anchor_lets_go(tmp_path: Path, stop: float)
     assert last.position[tip, 2] - model.lattice.nodes[tip, 2] == pytest.approx(0.02, rel=1e-8)
     # the tip moves on after its release
     assert (frames[-1].position[tip, 2] - model.lattice.nodes[tip, 2]).min() > 0.0201
+
+
+def test_a_viscous_body_that_an_anchor_lets_go_falls_freely(tmp_path: Path):
+    """BDF2's first step after the event began with the anchor and lost part of gravity."""
+    path = block_scene(
+        tmp_path,
+        np.array([0.25, 0.125, 0.25]),
+        time={"step": 0.01, "duration": 0.08, "integrator": "bdf2", "error": 0.01},
+        material=solid_of(1e5) | {"retardation_time": 0.01},
+        anchor=[
+            {"region": half_space(2), "path": [{"time": 0.04, "by": [0, 0, 0.02]}], "stop": 0.04}
+        ],
+        gravity=GRAVITY,
+    )
+    model, frames = play(path)
+    speeds = [frame.momentum[2] / model.lattice.mass.sum() for frame in frames[4:]]
+    np.testing.assert_allclose(np.diff(speeds), -G * 0.01, rtol=1e-6)
 
 
 def test_a_failed_step_is_taken_again_shorter(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -356,9 +356,9 @@ class Bdf2(ImplicitEuler):
         new velocity and with the node's present acceleration. Without this acceleration, an impact
         would add energy.
         """
+        self._let_go(time)
         if state.history is None and self.retardation:
             return self._first_of_viscous(state, time)
-        self._let_go(time)
         q, v, work_before = state.q, state.velocity(self.time_step), Work()
         begin, forces = time - self.time_step, self.environment.forces
         history, begun_error = state.history, 0.0

@@ -7,7 +7,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from block_scene import GRAVITY, block_scene, box_at, loop_of, plane_at, solid_of
+from block_scene import CLAMP, GRAVITY, block_scene, box_at, loop_of, plane_at, solid_of
 from conftest import run
 from lattices import COMM, T, beam, one_spring, weight
 from one_process import assert_one_line
@@ -138,6 +138,21 @@ def test_newtons_linear_solves_tell_the_error(tmp_path: Path):
             products.append(file["frames"]["products"][:].sum())
         assert (said <= 1e-3).all() and (true < 3 * said).all()
     assert products[0] < 0.9 * products[1]
+
+
+def test_the_first_step_of_a_viscous_body_has_no_true_error_of_another_step(tmp_path: Path):
+    """A step of length t has another solver than BDF2's steps: the error was 0.8."""
+    scene = block_scene(
+        tmp_path,
+        time={"step": 0.01, "duration": 0.02, "integrator": "bdf2"},
+        material=solid_of(1e5) | {"retardation_time": 0.005},
+        pin=[CLAMP],
+        gravity=GRAVITY,
+        solver={"error": 1e-3},
+    )
+    with loop_of(scene, true_error=1) as simulation:
+        _, first, second = simulation.frames()
+    assert np.isnan(first.true_error) and 0 < second.true_error < 3 * second.step_error
 
 
 def test_true_errors_are_those_of_a_dense_solve_of_one_spring():

@@ -6,6 +6,7 @@ matrix A is the paper's local/global iteration x <- x - A^(-1) F(x) (Eq. 17). Th
 """
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from petsc4py import PETSc
@@ -174,12 +175,22 @@ def find_preset(name: str) -> Preset:
     try:
         base = PRESETS[added.get("based_on", "newton")]
         words = options_of(words_of(added["options"]))
-        return replace(base, about=str(added.get("about", "")), options=base.options | words)
+        kept = {key: base.options[key] for key in base.options.keys() - unfit(base.options, words)}
+        return replace(base, about=str(added.get("about", "")), options=kept | words)
     except (KeyError, TypeError, AttributeError):
         raise InputError(
             f'the preset {name!r} is no table of "options", "based_on" '
             f'(one of {", ".join(PRESETS)}) and "about"'
         ) from None
+
+
+def unfit(options: Mapping[str, str], given: Mapping[str, str]) -> set[str]:
+    """Return the names of options that fit only the type that given options replace."""
+    return {
+        bound
+        for name, bound in BOUND_TO_TYPE.items()
+        if given.get(name, options.get(name)) != options.get(name)
+    }
 
 
 def shown_options(solvers: dict[str, tuple[Preset, int]]) -> list[str]:
@@ -227,12 +238,7 @@ class SolverOptions:
             for name, value in database.getAll().items()
             if name.startswith(prefix) and not in_use[name]
         }
-        unfit = {
-            bound
-            for name, bound in BOUND_TO_TYPE.items()
-            if users.get(name, options.get(name)) != options.get(name)
-        }
-        ours = options.keys() - users.keys() - unfit
+        ours = options.keys() - users.keys() - unfit(options, users)
         if database.getString(f"{prefix}snes_type", "") in SOLVE_THEMSELVES:
             ours -= {name for name in ours if name.startswith("npc_")} | {"snes_npc_side"}
         for name in ours:

@@ -178,6 +178,18 @@ def test_presets_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture[str])
         list(msm.frames(scene, set={"solver.preset": "wrong"}))
 
 
+def test_a_preset_with_another_type_of_solver_drops_the_norm_of_the_old_type(tmp_path: Path):
+    """PETSc refused the preset, because minres lacks CG's natural norm."""
+    msm.register_preset("minres", {"ksp_type": "minres"})
+    scene = block_scene(
+        tmp_path,
+        time={"step": STEP, "duration": STEP},
+        start={"velocity": [0, 0, SPEED], "scale": [1.1, 1, 1]},
+        solver={"preset": "minres"},
+    )
+    assert [frame.ksp_its > 0 for frame in msm.frames(scene)] == [False, True]
+
+
 PLUGIN = """
 RIBBON = {"options": {"ksp_rtol": 1e-7}, "based_on": "newton", "about": "installed"}
 def drag(x, v, t):

@@ -88,6 +88,15 @@ def test_let_go_a_body_keeps_the_momentum_that_its_path_gave_it(tmp_path: Path):
     ).all()
 
 
+def test_let_go_a_body_of_bdf2_does_not_go_on_with_the_anchor_s_force(tmp_path: Path):
+    """The history of BDF2 holds the force, half a step of which once remained."""
+    time = {"step": T, "duration": 15 * T, "integrator": "bdf2"}
+    led = {"region": LEFT, "path": UP, "stop": 0.06 + 0.5 * T}
+    _, frames = play(block_scene(tmp_path, time=time, anchor=[led]))
+    for frame in frames[7:]:
+        np.testing.assert_allclose(frame.momentum, frames[6].momentum, rtol=1e-6)
+
+
 def test_every_node_held_is_refused_until_one_is_free(tmp_path: Path):
     anchors = [{"region": {"box": [[-1, -1, -1], [1, 1, z]]}, "path": UP} for z in (0.3, 0.2)]
     with pytest.raises(

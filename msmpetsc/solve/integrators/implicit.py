@@ -296,13 +296,15 @@ class ImplicitEuler(Integrator):
             solid=self.environment.elasticity.solid,
         )
 
-    def _let_go(self, time: float) -> None:
-        """Make a new solver if an anchor has ended by ``time`` [s] (collective)."""
+    def _let_go(self, time: float) -> bool:
+        """Make a new solver if an anchor has ended by ``time`` [s]; return whether (collective)."""
         anchors = self.environment.anchors.acting(time)
-        if len(anchors) < len(self.anchors):
+        has_ended = len(anchors) < len(self.anchors)
+        if has_ended:
             self.anchors = anchors
             # Begin with the first tau, because a resumed run does not know the old tau.
             self._renew(self._first_tau(), time)
+        return has_ended
 
     def _renew(self, tau: float, time: float) -> None:
         """Make a new solver for a tau [s] and the nodes free at a time [s] (collective)."""
@@ -356,7 +358,8 @@ class Bdf2(ImplicitEuler):
         new velocity and with the node's present acceleration. Without this acceleration, an impact
         would add energy.
         """
-        self._let_go(time)
+        if self._let_go(time):
+            state = replace(state, history=None)
         if state.history is None and self.retardation:
             return self._first_of_viscous(state, time)
         q, v, work_before = state.q, state.velocity(self.time_step), Work()

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from block_scene import CELL, DENSITY, SIDES, YOUNG, block_scene, model_of, play, solid_of
 
 from msmpetsc.build import Model
@@ -57,6 +58,22 @@ def test_each_cell_resists_as_its_own_material(tmp_path: Path):
     lattice = of_parts(tmp_path, {"region": FAR, "young_modulus": 5 * YOUNG}, **law).lattice
     energies = [Elasticity(one).energy(one.nodes * [1, 1, -1]) for one in (soft, lattice)]
     assert energies[1] == pytest.approx((1 + 5) / 2 * energies[0], rel=1e-12)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_cut_cells_beside_a_part_keep_their_material(tmp_path: Path, sign: int):
+    """A part that ends in a plane of the grid has no share in the cells behind the plane."""
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=2 * CELL)
+    ball.export(tmp_path / "ball.ply")
+    stiff = {"young_modulus": 1000 * YOUNG}
+    part = {"region": {"half_space": {"point": [0, 0, 0], "normal": [0, 0, sign]}}} | stiff
+    both, only = (
+        of_parts(tmp_path, one, mesh={"source": "ball.ply"}, material=solid_of(YOUNG)).lattice
+        for one in (part, {"region": ALL, "young_modulus": YOUNG})
+    )
+    above = sign * both.nodes[both.cells].mean(axis=1)[:, 2] > 0
+    ratio = np.where(above, 1000.0, 1.0)
+    np.testing.assert_allclose(both.cell_stiffness, ratio * only.cell_stiffness, rtol=1e-12)
 
 
 def test_the_last_part_of_a_cell_wins_key_by_key(tmp_path: Path):

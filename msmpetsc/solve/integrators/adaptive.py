@@ -380,8 +380,7 @@ class Adaptive(Integrator):
                 free.any(axis=1) @ self.environment.obstacles.change_of_push(*ends, end, t)
             )
         sums += [mass @ (coming**2).sum(axis=1), late]
-        means = reduced(self.comm, [float(part) for part in sums]) / self.mass
-        error, motion, coming, late = means
+        error, motion, coming, late = reduced(self.comm, list(map(float, sums))) / self.mass
         late += result.begun_error / math.sqrt(self.mass)
         if not self.control.motion:
             # Vibrations between frames make ``coming`` too large. The step's longest

@@ -66,8 +66,14 @@ def prepare(
 
 
 def merge(surface: Surface) -> Surface:
-    """Merge points of equal position, and drop degenerate triangles and unused points."""
-    return compact(surface.points, merged_triangles(surface))
+    """Merge points of equal position, and drop degenerate triangles and unused points.
+
+    Raises InputError if all triangles are degenerate.
+    """
+    triangles = merged_triangles(surface)
+    if len(triangles) == 0:
+        raise InputError("all triangles are degenerate")
+    return compact(surface.points, triangles)
 
 
 def largest_part(surface: Surface) -> Surface:

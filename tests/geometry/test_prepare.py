@@ -218,7 +218,7 @@ def test_a_step_that_leaves_nothing_is_an_error():
     point = Surface(np.zeros((3, 3)), np.array([[0, 1, 2]]))
     for step in ("merge", "union", "repair", {"simplify": 10}):
         name = step if isinstance(step, str) else "simplify"
-        with pytest.raises(InputError, match=f"'{name}'"):
+        with pytest.raises(InputError, match=f"'{name}': all triangles are degenerate"):
             prepare(point, [step])
     with pytest.raises(InputError, match="size"):
         prepare(point, [], size=1.0)

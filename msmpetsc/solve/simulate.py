@@ -28,7 +28,8 @@ from msmpetsc.scene.time import Time
 from msmpetsc.solve.energy_balance import EnergyBalance
 from msmpetsc.solve.instrumentation import REFERENCE_PREFIX, REFERENCE_PRESET, Monitors, true_errors
 from msmpetsc.solve.integrators.adaptive import Adaptive
-from msmpetsc.solve.integrators.implicit import Bdf2, ImplicitEuler
+from msmpetsc.solve.integrators.bdf2 import Bdf2
+from msmpetsc.solve.integrators.implicit import ImplicitEuler
 from msmpetsc.solve.integrators.integrator import Integrator, State
 from msmpetsc.solve.integrators.static import Static
 from msmpetsc.solve.integrators.verlet import Verlet

@@ -71,7 +71,7 @@ def energy_left(integrator: str, wt: float, steps: int) -> float:
     """Return the energy left of x'' = -w^2 x from x = 1 and x' = 0, by the scheme itself.
 
     The scheme acts on z = x + i x' / w, whose rate is -i w z. BDF2 begins with an implicit Euler
-    step of two thirds (solve.integrators.implicit.Bdf2).
+    step of two thirds (solve.integrators.bdf2).
     """
     # matrix of t d/dt for (x, x' / w)
     matrix = wt * np.array([[0, 1], [-1, 0]])

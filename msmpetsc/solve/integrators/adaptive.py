@@ -5,7 +5,7 @@ The local error of a step follows from positions q and velocities v at its ends:
     implicit Euler  t/2 (v_(n+1) - v_n)                            = t^2/2 a  + O(t^3)
     BDF2            8/5 (q_(n+1) - q_n - t/2 (v_n + v_(n+1)))      = 2/9 t^3 da/dt + O(t^4)
 
-A BDF2 step without history has a further error (solve.integrators.implicit.Bdf2).
+A BDF2 step without history has a further error (solve.integrators.bdf2).
 ``StepControl`` sums the root mean squares of local errors. It also counts errors from impacts and
 from changes of penalty forces (scripts/docs/pages/time-steps.md).
 

@@ -67,7 +67,7 @@ class StepResult:
     tau          : tau of the problem [s]
     viscous      : gradient of the dissipation potential D (owned, 3) [N]; None without viscosity
     begun_error  : error of the history that a BDF2 step without history computes for itself
-                   (solve.integrators.implicit.Bdf2) [m sqrt(kg)]
+                   (solve.integrators.bdf2) [m sqrt(kg)]
     viscous_work : decrease of D from ``problem.fixed_positions`` to ``position``, this rank's part
                    [J]
     """
